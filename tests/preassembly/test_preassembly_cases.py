@@ -15,7 +15,7 @@ from processor import large_arrays
 from processor.adjustment import scanner_class_errors
 from processor.geometry import rigid
 from processor.geometry.thinning import by_cell
-from processor.model import ArchDesign, DesignPart, Scan, reason
+from processor.model import ArchDesign, DesignPart, Scan, Status, reason
 from processor.preassembly.ends import bottom_edges
 from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.params import SystematicParams
@@ -220,6 +220,31 @@ def test_neighbours_swapped_are_named(monkeypatch):
     assert found.reasons[-1] == reason("preassemble.size-of-other", parts=("rib1", "rib3"))
 
 
+def along_the_arch(came, to):
+    """T (4, 4) that turns the bridge of numpy about the arch's middle until the cut ``came`` is at the cut ``to``."""
+    turn = (arch_clouds.CUTS[to] - arch_clouds.CUTS[came]) * arch_clouds.ARC / arch_clouds.RADIUS
+    middle = arch_clouds.RADIUS * np.array([np.sin(arch_clouds.HALF_ANGLE), 0.0, -np.cos(arch_clouds.HALF_ANGLE)])
+    R = rigid.rotation_from_vector(np.array([0.0, turn, 0.0]))
+    return rigid.transform(R, middle - R @ middle)
+
+
+def test_scan_of_a_shorter_part_in_a_longer_one_s_place_is_named_by_its_ends(monkeypatch):
+    """All of its points lie on the longer part: that has steel where they end, which is not seen."""
+    scene, truth = arch_clouds.bridge(spacing_mm=30.0, sigma_mm=1.0, seed=1)
+    points = rigid.apply(truth.arch.T_bridge_scan[2], scene.scans[2].points)
+    poses = {"rib1": along_the_arch(2, 1), "rib2": np.eye(4)}
+    find = lambda _, part, *__: attitude.Attitude(poses[part.name], poses[part.name], Status.OK)  # noqa: E731
+    monkeypatch.setattr(attitude, "find", find)
+    monkeypatch.setattr(assignment, "rather", lambda *_: None)  # as where the underside was not seen: sizes are others
+    found = measure._place(Scan("scan", points, component="rib1"), 1, shapes_of(scene.arch), 1.0)
+    assert (found.rejected, codes(found.doubts), found.parts) == ((), ["preassemble.ends-of-other"], ("rib2",))
+    longer = (arch_clouds.CUTS[2] - arch_clouds.CUTS[1] - arch_clouds.CUTS[3] + arch_clouds.CUTS[2]) * arch_clouds.ARC
+    # The outermost points of either end are some mm from it, as points 30 mm apart leave.
+    assert found.doubts[0].values["length"] == pytest.approx(longer, abs=10.0)
+    own = measure._place(Scan("scan", points, component="rib2"), 2, shapes_of(scene.arch), 1.0)
+    assert (own.rejected, own.doubts, own.parts) == ((), (), ("rib2",))
+
+
 def test_scan_that_covers_half_of_another_part_is_rejected(monkeypatch):
     """A rib turned about the arch's middle until it ends where the foot does: its upper half lies on the foot.
 
@@ -227,10 +252,7 @@ def test_scan_that_covers_half_of_another_part_is_rejected(monkeypatch):
     """
     scene, truth = arch_clouds.bridge(spacing_mm=30.0, sigma_mm=1.0, seed=1)
     points = rigid.apply(truth.arch.T_bridge_scan[2], scene.scans[2].points)
-    turn = (arch_clouds.CUTS[1] - arch_clouds.CUTS[3]) * arch_clouds.ARC / arch_clouds.RADIUS
-    middle = arch_clouds.RADIUS * np.array([np.sin(arch_clouds.HALF_ANGLE), 0.0, -np.cos(arch_clouds.HALF_ANGLE)])
-    R = rigid.rotation_from_vector(np.array([0.0, turn, 0.0]))
-    points = (points - middle) @ R.T + middle
+    points = rigid.apply(along_the_arch(3, 1), points)
     rng, top = np.random.default_rng(1), points[np.argmax(points[:, 2])]
     mast = top + np.column_stack([rng.normal(0.0, 30.0, (900, 2)), rng.uniform(0.0, 5000.0, 900)])
     known(monkeypatch, np.eye(4))

@@ -61,7 +61,7 @@ def rather(points: Floats, index: int, shapes: Shapes) -> int | None:
     Of parts with equal edges, which their marks alone distinguish, it is any: see :mod:`.identity`.
     """
     alike = of_size(points, shapes)
-    others = _other_shapes(index, alike or range(len(shapes)), shapes)
+    others = other_shapes(index, alike or range(len(shapes)), shapes)
     if index in alike and not others:
         return None
     few = thinned(points, POINTS)
@@ -93,7 +93,7 @@ def rather(points: Floats, index: int, shapes: Shapes) -> int | None:
     return best if _shows_other(few, own, rival) else None
 
 
-def _other_shapes(index: int, numbers: Iterable[int], shapes: Shapes) -> list[int]:
+def other_shapes(index: int, numbers: Iterable[int], shapes: Shapes) -> list[int]:
     """Return one part, of those in ``numbers``, of each shape that is not that of part ``index``."""
     different = [index]
     for number in numbers:
@@ -108,7 +108,7 @@ def locate(points: Floats, index: int, shapes: Shapes) -> tuple[Floats, int, flo
     Returns the pose T_bridge_scan (4, 4) of the part that the body there shows, which may be another than ``index``,
     with its number, and the points on another body of the same shape, as a share of those on this one.
     """
-    numbers = [index, *_other_shapes(index, range(len(shapes)), shapes)]
+    numbers = [index, *other_shapes(index, range(len(shapes)), shapes)]
     designs = [shapes[k] for k in numbers]
     (own,) = located_part.locate(points, designs[:1])
     if located_part.most_shown([own]) < located_part.LEAST_SHOWN:

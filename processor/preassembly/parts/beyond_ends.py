@@ -1,4 +1,4 @@
-"""Steel in a scan beyond an end of its part that is no more of the part: splice plates bolted to it.
+"""Steel in a scan beyond an end of its part that is no more of the part: splice plates; and steel before it not shown.
 
 A part that is too long goes on with its own section. Splice plates lie on its faces, a plate's thickness off them and
 on opposite sides; what the part rests on lies on one side alone.
@@ -22,6 +22,7 @@ FEWEST, POINTS = 60, 20_000  # points that show steel; points of the section tha
 OWN_SHARE = 0.05  # of the section's points on as much of its length
 OFF_SHARE = 0.3  # of the points beyond the end: plates have two sides, one of them on the part's face
 SIDE_SHARE = 0.15  # of the points off the section on either of two opposite sides
+OUTERMOST = 10  # points on the part at an end of what is shown of it: fewer are strays
 
 
 def plates(points: Floats, place: EndPlace) -> bool:
@@ -41,3 +42,11 @@ def plates(points: Floats, place: EndPlace) -> bool:
         return False
     share = np.stack([(off > OFF_MM).mean(axis=0), (off < -OFF_MM).mean(axis=0)])
     return bool((share > SIDE_SHARE).all(axis=0).any())
+
+
+def not_shown(points: Floats, place: EndPlace) -> float:
+    """Length before an end, mm, on which no points (n, 3) are; of those on the part's surface in the bridge's frame."""
+    local = rigid.apply(rigid.invert(place.T_bridge_joint), points)
+    reach = np.maximum(place.half[1:], place.section.radius) + AROUND_MM
+    before = -place.outward * local[(np.abs(local[:, 1:]) < reach).all(axis=1), 0]
+    return float(np.partition(before, OUTERMOST)[OUTERMOST]) if len(before) > OUTERMOST else float("inf")

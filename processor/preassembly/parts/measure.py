@@ -21,7 +21,7 @@ from processor.preassembly import topology
 from processor.preassembly.ends import bottom_edges, joint_end, outer_end, outer_faces, tube_end, view_variance
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
 from processor.preassembly.ends.joint_end import FittedEnd, JointEnd
-from processor.preassembly.ends.joint_frame import end_place
+from processor.preassembly.ends.joint_frame import EndPlace, end_place
 from processor.preassembly.ends.outer_end import OuterEnd
 from processor.preassembly.ends.outer_faces import RegisteredPart
 from processor.preassembly.ends.tube_end import FittedTube
@@ -37,7 +37,7 @@ from processor.preassembly.parts import (
 from processor.preassembly.parts.assignment import ScanParts
 from processor.preassembly.parts.part_in_chain import Member
 from processor.preassembly.parts.part_residuals import PartResiduals, part_residuals
-from processor.registration import icp, located_part, main_body, surface_registration
+from processor.registration import icp, located_part, main_body, pose_choice, principal, surface_registration
 from processor.registration.pose_search import DesignSurface
 from processor.robust_statistics import MAD_TO_SD
 
@@ -47,6 +47,9 @@ SLICES, LEAST_OF_TYPICAL = (
     0.1,
 )  # of a part's length; of the median number of points on a slice's side: it is covered
 ACROSS = 0.7  # cosine to the part's axis, below which a normal is of the part's sides
+# By the ends of two parts, of which one is longer: as built they are right to some mm, and steel is shown up to its end
+# to a spacing of points.
+SHORT_MM = 20.0
 LEAST_COVERED = 0.7  # chosen: of a part less seen, bow and twist are guesses; the doubt states the share
 RIGHT_PART = (reason("preassemble.right-part"),)
 
@@ -454,7 +457,40 @@ def _identified(scan: Scan, points: Floats, station: Ints, index: int, shapes: a
             return replace(placed, rejected=resemblance, parts=every)
         why = (*ScanParts(scan.name, part.name, placed.identity.rather).wrong, *placed.identity.contradiction)
         return replace(placed, rejected=why, parts=placed.identity.rather)
-    return replace(placed, parts=every if placed.rejected else placed.identity.parts(part.name))
+    if placed.rejected:
+        return replace(placed, parts=every)
+    of_ends = _by_ends(placed, index, shapes)
+    return of_ends or replace(placed, parts=placed.identity.parts(part.name))
+
+
+def _by_ends(placed: _PlacedScan, index: int, shapes: attitude.Shapes) -> _PlacedScan | None:
+    """Return a scan as one of other parts whose ends it shows, where part ``index`` goes on; None where it is not.
+
+    On a longer part of the same section all its points lie on the design, which has steel where they end.
+    """
+    T, points, part = placed.registration.T_design_scan, placed.points, shapes[index]
+    missing = sum(_not_shown(points, T, index, shapes))
+    found: list[str] = []
+    for k in assignment.other_shapes(index, range(len(shapes)), shapes) if SHORT_MM < missing < part.size else ():
+        shorter, limit = shapes.sizes[index][0] - shapes.sizes[k][0], principal.SIZE_SHARE * shapes.sizes[index][0]
+        if abs(shorter - missing) > SHORT_MM + limit:
+            continue
+        there = _register(placed.scan, points, placed.station, k, shapes)
+        T_there = there.registration.T_design_scan
+        if there.rejected or there.doubts or max(_not_shown(points, T_there, k, shapes)) > SHORT_MM:
+            continue
+        if 1 in pose_choice.choose(points, [(part.mesh, T), (shapes[k].mesh, T_there)]):
+            found += there.identity.parts(shapes.design.parts[k].name)
+    why = reason("preassemble.ends-of-other", parts=tuple(found), length=missing)
+    return replace(placed, doubts=(*placed.doubts, why), parts=tuple(found)) if found else None
+
+
+def _not_shown(points: Floats, T: Floats, index: int, shapes: attitude.Shapes) -> list[float]:
+    """Length before each of a part's joints, mm, that points (n, 3) placed by T (4, 4) do not show."""
+    placed = rigid.apply(T, thinned(points, surface_registration.LAST_POINTS))
+    face, off, beyond = shapes[index].mesh.distances(placed, surface_registration.GATES_MM[1])
+    on = placed[on_face(face, beyond) & (np.abs(off) < attitude.TELLING_MM)]
+    return [beyond_ends.not_shown(on, place) for _, place in _joint_ends(index, shapes)]
 
 
 def _register(scan: Scan, points: Floats, station: Ints, index: int, shapes: attitude.Shapes) -> _PlacedScan:
@@ -488,15 +524,19 @@ def _register(scan: Scan, points: Floats, station: Ints, index: int, shapes: att
 
 def _plated(points: Floats, T: Floats, index: int, shapes: attitude.Shapes) -> tuple[Reason, ...]:
     """State at which joints the points (n, 3), placed by T (4, 4), have splice plates; () for none."""
-    design = shapes.design
     placed = rigid.apply(T, thinned(points, surface_registration.LAST_POINTS))
-    joints = tuple(
-        design.joint_names[joint]
+    joints = tuple(joint for joint, place in _joint_ends(index, shapes) if beyond_ends.plates(placed, place))
+    return (reason("preassemble.splice-plates", joints=joints),) if joints else ()
+
+
+def _joint_ends(index: int, shapes: attitude.Shapes) -> list[tuple[str, EndPlace]]:
+    """Return the joints of a part by their names, with its end at each."""
+    design = shapes.design
+    return [
+        (design.joint_names[joint], end_place(design.joint_points[joint], outward, shapes[index].mesh))
         for joint, outward in topology.ends_of(design.joined, index)
         if joint is not None
-        and beyond_ends.plates(placed, end_place(design.joint_points[joint], outward, shapes[index].mesh))
-    )
-    return (reason("preassemble.splice-plates", joints=joints),) if joints else ()
+    ]
 
 
 def _identities(placed: Sequence[_PlacedScan], part: DesignPart) -> tuple[ScanParts, ...]:
