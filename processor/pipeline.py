@@ -490,7 +490,7 @@ def find_input(results: Path) -> Path:
 
     Their folder may also lie in the input. Raises UsageError where there is none.
     """
-    from processor import store
+    from processor.store import store
 
     name = str(store.read_provenance(results).get("input", ""))
     folders = (results.resolve().parent.parent, Path.cwd())

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from processor import large_arrays, readers, scene_cloud, store
+from processor import large_arrays, readers, scene_cloud
 from processor.adjustment import distance_summary
 from processor.adjustment.distance_summary import Summary
 from processor.compare import core_tiles, diagnosis, units
@@ -27,7 +27,7 @@ from processor.model import Floats, InputError, Reason, Scan, UsageError, reason
 from processor.readers import RawScan
 from processor.readers.raw_scan import FAR, ORIGIN_STEP, summed
 from processor.scan_folder.units import MM_PER_UNIT, FileUnit
-from processor.store import checksums
+from processor.store import checksums, store
 
 CLOUDS = ("reference", "compared", "core")
 

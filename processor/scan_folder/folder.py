@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from processor import large_arrays, readers, record_checks, store
+from processor import large_arrays, readers, record_checks
 from processor.geometry import rigid
 from processor.language.messages import messages
 from processor.meshes.mesh_files import SUFFIXES as MESH_SUFFIXES
@@ -62,6 +62,7 @@ from processor.scan_folder.shapes import surface_files
 from processor.scan_folder.text_files import read_toml
 from processor.scan_folder.tolerance import check_components, read_tolerance
 from processor.scan_folder.units import MM_PER_UNIT, FileUnit, file_unit, known_unit
+from processor.store import store
 
 FLOAT_STEP_MM = 1.0
 LARGEST_MM = units.LARGEST_KM * MM_PER_UNIT["km"]  # of a scan in a wrong unit that fills the memory

@@ -2,8 +2,9 @@
 
 from pathlib import Path
 
-from processor import pipeline, store
+from processor import pipeline
 from processor.scan_folder import files
+from processor.store import store
 
 
 def test_the_current_folder_has_a_name_and_is_found_around_its_results(tmp_path, monkeypatch):

@@ -6,9 +6,9 @@ import json
 import numpy as np
 import pytest
 
-from processor import store
 from processor.model import InputError
 from processor.scan_folder import folder
+from processor.store import store
 from tests.support.files.scan_folders import BOX, TRIANGLES, arch_design, part, surface, write_ply, write_xyz
 
 

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from processor import store
 from processor.model import InputError
 from processor.scan_folder import folder, guess, node_list
+from processor.store import store
 from processor.writers import project
 from tests.support.files.scan_folders import surface, write_xyz
 

@@ -11,7 +11,6 @@ import h5py
 import numpy as np
 import pytest
 
-from processor import store
 from processor.language.messages import messages
 from processor.model import (
     Checked,
@@ -29,7 +28,7 @@ from processor.model import (
 )
 from processor.space_frame import step as space_frame_step
 from processor.space_frame.result import Balls
-from processor.store import checksums, codec
+from processor.store import checksums, codec, store, streaming
 from processor.store.whole_output import whole_folder
 from tests.support.files.old_files import sealed_again
 from tests.support.results.records import assert_equal
@@ -52,7 +51,7 @@ def lexicographic(points):
 
 def in_box(path, lower, upper):
     """Points of a file's first scan within a box."""
-    with store.points_of(path) as points:
+    with streaming.points_of(path) as points:
         whole = (np.full((1, 3), -np.inf), np.full((1, 3), np.inf))
         boxed = points.near([(np.atleast_2d(lower), np.atleast_2d(upper)), *[whole] * (len(points.scans) - 1)])
         pieces = [piece for piece, _ in boxed.read(0)]

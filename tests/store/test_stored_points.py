@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from processor import store
 from processor.model import Scan, Scene, Stations
 from processor.space_frame.points.source import SceneSource
-from processor.store import points_of
+from processor.store import store
+from processor.store.streaming import points_of
 from processor.views import views
 
 
