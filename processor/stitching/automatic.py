@@ -5,12 +5,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from processor.adjustment import scanner_class_errors
 from processor.geometry import rigid, thread_ranges
-from processor.model import Control, Floats, Scan
+from processor.model import Control, Floats, Scan, reason
 from processor.stitching import three_point
 from processor.stitching.coarse import network, pairwise
 from processor.stitching.coarse.pairwise import ScanPatches, ScoredPose
@@ -24,13 +25,12 @@ from processor.stitching.fine import (
     pairs_and_loops,
 )
 from processor.stitching.fine.bundle_adjustment import Solution
-from processor.stitching.fine.contradictions import Contradiction
 from processor.stitching.fine.correspondences import Blocks, CellTable
-from processor.stitching.fine.pairs_and_loops import Pair
 from processor.stitching.params import Params
 from processor.stitching.planes import scan_planes
 from processor.stitching.planes.scan_planes import Cloud
 from processor.stitching.three_point import Picked
+from processor.stitching.to_result import Network
 
 # Lengths in sides of the cells.
 GATES = (0.25, 0.15, 0.08)  # distance of faces of different scans that are taken as one, from adjustment to adjustment
@@ -43,25 +43,9 @@ STILL_MM = 0.02  # largest shift of a pose at convergence
 Given = tuple[Picked, Mapping[int, Floats], Mapping[int, Floats]]  # picks, poses by control points, poses in the files
 
 
-@dataclass(frozen=True)
-class RegisteredScans:
-    """Poses, covariance and checks of scans, in the frames of their clouds."""
-
-    clouds: list[Cloud]
-    coarse: network.CoarsePoses
-    solution: Solution
-    pairs: list[Pair]
-    overlap: list[float]  # of each pair
-    elsewhere: list[bool]  # whether the best candidate pose of each pair is not the adjusted one
-    contradictions: list[Contradiction]  # of each scan's pose
-    refuted: Floats  # (k,), see network.refuted
-    # pairs of scans that overlap, not contradicted by free space, and those whose relative pose is by control points
-    links: list[tuple[int, int]]
-
-
 def stitch(
     scans: Sequence[Scan], params: Params, reference: int, picked: Picked, control: Control | None = None
-) -> RegisteredScans:
+) -> Network:
     """Register two or more scans in the frame of scan ``reference``, a row of ``scans``.
 
     Candidate poses of all pairs are scored by matching patches and free space, the scans are placed by these one after
@@ -100,15 +84,25 @@ def stitch(
         added, _ = direction_errors.added_covariance(blocks, solution, reference)
     solution = replace(solution, covariance=solution.covariance + added)
     scores = network.scores(patches, solution.T, placed.still is not None)
-    return RegisteredScans(
-        clouds=clouds,
+    stated = []
+    for pair in pairs:
+        adjusted, found, b = scores[pair.a, pair.b], candidates[pair.a, pair.b], patches[pair.b]
+        elsewhere = not found or not pairwise.same(found[0].T_a_b, adjusted.T_a_b, b.side_mm, b)
+        why = (reason("stitch.pair-elsewhere"),) if elsewhere else ()
+        why = (reason("stitch.pair-contradicts"),) if pair.is_gross else why
+        stated.append(replace(pair, overlap=adjusted.overlap, used=not pair.is_gross, reasons=why))
+    noise, class_mm = float(np.median([cloud.sigma_mm for cloud in clouds])), scanner_class_errors.known().view_mm
+    # Where the prior determines a scan's range error better than the faces.
+    unseen = tuple(scans[s].name for s in np.flatnonzero(solution.ranges_sd > np.sqrt(0.5) * class_mm).tolist())
+    return Network(
+        T=solution.T,
+        covariance=solution.covariance,
+        origins=np.stack([cloud.origin for cloud in clouds]),
         coarse=coarse,
-        solution=solution,
-        pairs=pairs,
-        overlap=[scores[pair.a, pair.b].overlap for pair in pairs],
-        elsewhere=[
-            _is_elsewhere(candidates[pair.a, pair.b], scores[pair.a, pair.b], patches[pair.b]) for pair in pairs
-        ],
+        pairs=stated,
+        estimated=(noise, solution.tau[0], solution.tau[1]),
+        point_mm=noise,
+        reasons=(reason("stitch.ranges-by-class", scans=unseen, sd_mm=class_mm),) if unseen else (),
         contradictions=contradictions.of_scans(cells, solution, GATES[0] * cells.size_mm),
         refuted=np.where(
             [s in known and reference in known for s in range(len(scans))],
@@ -239,7 +233,3 @@ def _without_gross_pairs(
     keep = np.array([piece not in out for piece in blocks.piece.tolist()], bool)
     blocks = blocks.take(keep).shared()
     return bundle_adjustment.solve(blocks, solution.T, reference), blocks
-
-
-def _is_elsewhere(candidates: list[ScoredPose], adjusted: ScoredPose, b: ScanPatches) -> bool:
-    return not candidates or not pairwise.same(candidates[0].T_a_b, adjusted.T_a_b, b.side_mm, b)

@@ -8,15 +8,15 @@ points that span a plane fix the frame of either method's result and correct its
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from processor import diagnostics, large_arrays
-from processor.adjustment import scanner_class_errors
 from processor.model import Floats, InputError, Reason, Scan, Scene, UsageError, reason
 from processor.stitching import automatic, three_point, to_result, verdicts
+from processor.stitching.coarse.network import CoarsePoses
 from processor.stitching.fine.pairs_and_loops import Pair
 from processor.stitching.params import METHODS, Params
 from processor.stitching.result import Result
@@ -68,48 +68,13 @@ def run(scene: Scene, params: Params) -> Result:
             )
         network = _by_picks(scene.scans, picked, reference, params)
     else:
-        network = _automatic(scene, picked, reference, params)
+        network = automatic.stitch(scene.scans, params, reference, picked, scene.control)
     result = to_result.result(scene.scans, to_result.controlled(network, scene), reference, params)
     return replace(result, limits=verdicts.judge(scene, result))
 
 
-def _automatic(scene: Scene, picked: Picked, reference: int, params: Params) -> Network:
-    scans = scene.scans
-    registered = automatic.stitch(scans, params, reference, picked, scene.control)
-    solution, coarse = registered.solution, registered.coarse
-    gross = [pair.is_gross for pair in registered.pairs]
-    noise = float(np.median([cloud.sigma_mm for cloud in registered.clouds]))
-    # Where the prior determines a scan's range error better than the faces.
-    unseen = np.flatnonzero(solution.ranges_sd > np.sqrt(0.5) * scanner_class_errors.known().view_mm).tolist()
-    by_class = reason(
-        "stitch.ranges-by-class", scans=tuple(scans[s].name for s in unseen), sd_mm=scanner_class_errors.known().view_mm
-    )
-    return Network(
-        T=solution.T,
-        covariance=solution.covariance,
-        origins=np.stack([cloud.origin for cloud in registered.clouds]),
-        rivalry=coarse.rivalry,
-        T_rival=coarse.T_rival,
-        contrary=coarse.contrary,
-        largest_overlap=coarse.overlap,
-        pairs=registered.pairs,
-        overlap=np.array(registered.overlap),
-        used=[not is_gross for is_gross in gross],
-        pair_reasons=[
-            (reason("stitch.pair-contradicts"),) if is_gross else (reason("stitch.pair-elsewhere"),) if other else ()
-            for is_gross, other in zip(gross, registered.elsewhere, strict=True)
-        ],
-        contradictions=registered.contradictions,
-        refuted=registered.refuted,
-        links=registered.links,
-        estimated=(noise, solution.tau[0], solution.tau[1]),
-        point_mm=noise,
-        reasons=(by_class,) if unseen else (),
-    )
-
-
 def _by_picks(scans: Sequence[Scan], picked: Picked, reference: int, params: Params) -> Network:
-    names, k = [scan.name for scan in scans], len(scans)
+    names = [scan.name for scan in scans]
     origins = np.stack([_origin(scan) for scan in scans])
     fits: dict[tuple[int, int], PairFit] = {}
     shortages: dict[tuple[int, int], Reason] = {}
@@ -119,34 +84,25 @@ def _by_picks(scans: Sequence[Scan], picked: Picked, reference: int, params: Par
         except three_point.TooFewError as error:
             shortages[a, b] = error.shortage
     pooled = three_point.pooled(list(fits.values())) if fits else []
-    pairs = [three_point.as_pair(a, b, fit) for (a, b), fit in zip(fits, pooled, strict=True)]
-    _say_pairs(names, fits, pooled, pairs, picked)
-    pair_reasons = [_of_pair(fit, params) for fit in pooled]
+    pairs = [three_point.as_pair(a, b, fit, _of_pair(fit, params)) for (a, b), fit in zip(fits, pooled, strict=True)]
+    _say_pairs(names, pooled, pairs, picked)
     unused = [
         reason("stitch.pair-not-used", a=names[a], b=names[b], shortage=shortage)
         for (a, b), shortage in shortages.items()
     ]
     of_pairs = [
-        reason("stitch.of-pair", a=names[a], b=names[b], reason=single)
-        for (a, b), row in zip(fits, pair_reasons, strict=True)
-        for single in row
+        reason("stitch.of-pair", a=names[pair.a], b=names[pair.b], reason=single)
+        for pair in pairs
+        for single in pair.reasons
     ]
-    adjusted = three_point.adjust(pairs, k, reference)
+    adjusted = three_point.adjust(pairs, len(scans), reference)
     misclosed = () if adjusted.factor == 1.0 else (reason("stitch.loops-misclose", factor=adjusted.factor),)
     return Network(
         T=adjusted.T,
         covariance=adjusted.covariance,
         origins=origins,
-        rivalry=np.zeros(k),
-        T_rival=np.full((k, 4, 4), np.nan),
-        contrary=np.zeros(k),
-        largest_overlap=np.ones(k),
+        coarse=CoarsePoses.unrivalled(adjusted.T),
         pairs=pairs,
-        overlap=np.full(len(pairs), np.nan),
-        used=[True] * len(pairs),
-        pair_reasons=pair_reasons,
-        scale=np.array([fit.scale for fit in pooled]),
-        scale_sd=np.array([three_point.widened(fit.scale_sd, fit.scaled_dof) for fit in pooled]),
         pose_scale_sd=adjusted.scale_sd,
         unplaced=_unplaced(names, shortages, {row for pair in fits for row in pair}),
         point_mm=float(np.median([fit.sd_mm for fit in pooled])) if pooled else float("nan"),
@@ -154,24 +110,19 @@ def _by_picks(scans: Sequence[Scan], picked: Picked, reference: int, params: Par
     )
 
 
-def _say_pairs(
-    names: Sequence[str],
-    keys: Iterable[tuple[int, int]],
-    fits: Sequence[PairFit],
-    pairs: Sequence[Pair],
-    picked: Picked,
-) -> None:
+def _say_pairs(names: Sequence[str], fits: Sequence[PairFit], pairs: Sequence[Pair], picked: Picked) -> None:
     """Say what the picks of each pair gave, for diagnostics."""
-    for (a, b), fit, pair in zip(keys, fits, pairs, strict=True):
-        with diagnostics.at(f"{names[a]}, {names[b]}"):
+    for fit, pair in zip(fits, pairs, strict=True):
+        of_pair = names[pair.a], names[pair.b]
+        with diagnostics.at(", ".join(of_pair)):
             diagnostics.note(
                 "three points",
-                points=len(fit.residuals),
+                points=pair.shared,
                 rms_mm=pair.residual,
                 pick_sd_mm=fit.sd_mm,
                 scale_ppm=1e6 * (fit.scale - 1.0),
             )
-            for name, points in zip((names[a], names[b]), picked[a, b], strict=True):
+            for name, points in zip(of_pair, picked[pair.a, pair.b], strict=True):
                 with diagnostics.placed(np.eye(4), f"scan {name}"):
                     diagnostics.keep(f"picks in {name}", points)
 

@@ -168,12 +168,13 @@ def widened(sd: float, dof: float) -> float:
     return float(student_factor(dof)) * sd
 
 
-def as_pair(a: int, b: int, fit: PairFit) -> Pair:
+def as_pair(a: int, b: int, fit: PairFit, reasons: tuple[Reason, ...]) -> Pair:
     """Convert the fit of scans a and b to a pair of the network."""
     residual = float(np.sqrt((fit.residuals**2).sum(axis=1).mean()))
     return Pair(
-        a=a, b=b, pieces=len(fit.residuals), T_a_b=fit.T_a_b, covariance=fit.covariance, residual=residual, chi2=0.0
-    )
+        a=a, b=b, shared=len(fit.residuals), T_a_b=fit.T_a_b, covariance=fit.covariance, residual=residual,
+        reasons=reasons, scale=fit.scale, scale_sd=widened(fit.scale_sd, fit.scaled_dof),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from processor.distinct_rows import components
 from processor.geometry import rigid
 from processor.model import NORMAL_95, Floats, InputError, Reason, Scan, Scene, Status, reason
 from processor.stitching import poses_with_scale
-from processor.stitching.coarse.network import AMBIGUOUS
+from processor.stitching.coarse.network import AMBIGUOUS, CoarsePoses
 from processor.stitching.fine import control_points, pairs_and_loops
 from processor.stitching.fine.contradictions import Contradiction
 from processor.stitching.fine.pairs_and_loops import Pair
@@ -30,16 +30,8 @@ class Network:
     T: Floats
     covariance: Floats  # (6k, 6k): rotations about each scan's own origin
     origins: Floats
-    rivalry: Floats
-    T_rival: Floats
-    contrary: Floats  # (k,) score that contradicts a scan's pose by the score that supports it
-    largest_overlap: Floats  # (k,) with another scan
+    coarse: CoarsePoses  # what competes with the poses and contradicts them
     pairs: list[Pair]
-    overlap: Floats
-    used: list[bool]
-    pair_reasons: list[tuple[Reason, ...]]
-    scale: Floats = field(default_factory=lambda: np.empty(0))
-    scale_sd: Floats = field(default_factory=lambda: np.empty(0))
     pose_scale_sd: Floats = field(default_factory=lambda: np.empty(0))  # (k,) of the scale in T; absent: it is fixed
     refuted: Floats = field(default_factory=lambda: np.empty(0))  # (k,), see :func:`network.refuted`
     contradictions: Sequence[Contradiction] = ()  # of each scan's pose by faces
@@ -68,7 +60,8 @@ def controlled(network: Network, scene: Scene) -> Network:
     if not placed.control.holds:
         return network
     return replace(
-        network, T=placed.T, covariance=placed.covariance, T_rival=placed.M @ network.T_rival,
+        network, T=placed.T, covariance=placed.covariance,
+        coarse=replace(network.coarse, T_rival=placed.M @ network.coarse.T_rival),
         by_control=placed.contradictions, base=rigid.transform(np.eye(3), placed.centre),
     )  # fmt: skip
 
@@ -116,26 +109,14 @@ def _scans(
 ) -> Scans:
     k = len(names)
     is_free = len(network.pose_scale_sd) > 0 and bool(np.nanmax(network.pose_scale_sd) > 0.0)
-    T, T_rival, covariance = np.full((k, 4, 4), NAN), np.full((k, 4, 4), NAN), np.full((k, 6, 6), NAN)
-    position, position_sd, rotation_sd = np.full((k, 3), NAN), np.full((k, 3), NAN), np.full((k, 3), NAN)
-    status = list[Status]()
-    reasons = list[tuple[Reason, ...]]()
-    for s in range(k):
-        if not np.isfinite(network.T[s]).all():
-            status.append(Status.FAILED)
-            reasons.append((network.unplaced[s] if network.unplaced else reason("stitch.no-overlap"),))
-            continue
-        posed = base @ network.T[s]
-        T[s] = rigid.with_origin(posed, network.origins[s])
-        position[s] = posed[:3, 3]
-        of_scan = poses_with_scale.turned(network.covariance[6 * s : 6 * s + 6, 6 * s : 6 * s + 6], base[:3, :3])
-        covariance[s] = rigid.about_origin(of_scan, position[s])
-        rotation_sd[s], position_sd[s] = np.sqrt(np.diag(of_scan)[:3]), np.sqrt(np.diag(of_scan)[3:])
-        if np.isfinite(network.T_rival[s]).all():
-            T_rival[s] = rigid.with_origin(base @ network.T_rival[s], network.origins[s])
-        state, why = _assess(network, s, position_sd[s], rotation_sd[s], params)
-        status.append(state)
-        reasons.append(() if why is None else (why,))
+    T, T_rival = (_of_files(base @ poses, network.origins) for poses in (network.T, network.coarse.T_rival))
+    position = (base @ network.T)[:, :3, 3]
+    own = network.covariance.reshape(k, 6, k, 6)[np.arange(k), :, np.arange(k)]
+    of_scans = np.stack([poses_with_scale.turned(one, base[:3, :3]) for one in own])
+    sd = np.sqrt(np.einsum("kii->ki", of_scans))
+    assessed = [_assess(network, s, sd[s], params) for s in range(k)]
+    status = [state for state, _ in assessed]
+    reasons: list[tuple[Reason, ...]] = [() if why is None else (why,) for _, why in assessed]
     unsure = tuple(name for name, state in zip(names, status, strict=True) if state == Status.AMBIGUOUS)
     for s in _not_joined(network.links, status, reference):
         # Where no rival pose is known, what made it weak is said first and stays the answer: people walk through scans.
@@ -147,17 +128,25 @@ def _scans(
         status=tuple(status),
         reasons=tuple(reasons),
         T_project_scan=T,
-        covariance=covariance,
+        covariance=np.stack([rigid.about_origin(one, at) for one, at in zip(of_scans, position, strict=True)]),
         position=position,
-        position_sd=position_sd,
-        rotation_sd=rotation_sd,
+        position_sd=sd[:, 3:],
+        rotation_sd=sd[:, :3],
         scale=np.array([poses_with_scale.scale_of(pose) if is_free else 1.0 for pose in T]),
         scale_sd=network.pose_scale_sd if is_free else np.zeros(k),
-        rivalry=network.rivalry,
+        rivalry=network.coarse.rivalry,
         T_rival_scan=T_rival,
         from_frame=tuple(map(_socs, names)),
         to_frame=(str(frame),) * k,
     )
+
+
+def _of_files(poses: Floats, origins: Floats) -> Floats:
+    """Return poses (k, 4, 4) for coordinates as in the files, which have the origins (k, 3); NaN of those not known."""
+    found = np.full_like(poses, NAN)
+    for s in np.flatnonzero(np.isfinite(poses).all(axis=(1, 2))):
+        found[s] = rigid.with_origin(poses[s], origins[s])
+    return found
 
 
 def _not_joined(links: Sequence[tuple[int, int]] | None, status: Sequence[Status], reference: int) -> list[int]:
@@ -196,12 +185,13 @@ def _strangers(names: Sequence[str], network: Network, scans: Scans, reference: 
     return (reason("stitch.not-of-network", scans=tuple(names[s] for s in out)),) if out else ()
 
 
-def _assess(
-    network: Network, s: int, position_sd: Floats, rotation_sd: Floats, params: Params
-) -> tuple[Status, Reason | None]:
-    """Return the status of a scan with a pose, and the first reason that it is not ok."""
-    if network.contrary[s] > CONTRARY:
-        return Status.WEAK, reason("stitch.free-space", percent=100.0 * network.contrary[s])
+def _assess(network: Network, s: int, sd: Floats, params: Params) -> tuple[Status, Reason | None]:
+    """Return the status of a scan whose pose has standard deviations (6,), and the first reason that it is not ok."""
+    coarse = network.coarse
+    if not np.isfinite(network.T[s]).all():
+        return Status.FAILED, network.unplaced[s] if network.unplaced else reason("stitch.no-overlap")
+    if coarse.contrary[s] > CONTRARY:
+        return Status.WEAK, reason("stitch.free-space", percent=100.0 * coarse.contrary[s])
     if network.contradictions and network.contradictions[s].is_significant:
         other = network.contradictions[s]
         return Status.WEAK, reason(
@@ -213,14 +203,15 @@ def _assess(
         )
     if network.by_control and (contradiction := network.by_control[s]):
         return Status.WEAK, contradiction
-    if network.largest_overlap[s] < LITTLE:
-        return Status.WEAK, reason("stitch.little-overlap", percent=100.0 * network.largest_overlap[s])
-    if network.rivalry[s] > AMBIGUOUS:
-        return Status.AMBIGUOUS, reason("stitch.rival-pose", percent=100.0 * network.rivalry[s])
-    if not np.isfinite(position_sd).all():
+    if coarse.overlap[s] < LITTLE:
+        return Status.WEAK, reason("stitch.little-overlap", percent=100.0 * coarse.overlap[s])
+    if coarse.rivalry[s] > AMBIGUOUS:
+        return Status.AMBIGUOUS, reason("stitch.rival-pose", percent=100.0 * coarse.rivalry[s])
+    rotation, position = 1e3 * sd[:3].max(), sd[3:].max()  # mrad, mm
+    if not np.isfinite(position):
         return Status.WEAK, reason("stitch.no-covariance")
-    if position_sd.max() > params.weak_mm or 1e3 * rotation_sd.max() > params.weak_mrad:
-        position, rotation = NORMAL_95 * position_sd.max(), 1e3 * NORMAL_95 * rotation_sd.max()
+    if position > params.weak_mm or rotation > params.weak_mrad:
+        rotation, position = NORMAL_95 * rotation, NORMAL_95 * position
         return Status.WEAK, reason("stitch.uncertain-pose", position_mm=position, rotation_mrad=rotation)
     if len(network.refuted) and network.refuted[s] > 0.0:
         return Status.AMBIGUOUS, reason("stitch.looked-through", percent=100.0 * network.refuted[s])
@@ -229,15 +220,10 @@ def _assess(
 
 def _pairs(names: Sequence[str], network: Network) -> Pairs:
     pairs, origins = network.pairs, network.origins
-    unknown = np.full(len(pairs), NAN)
     return Pairs.from_items(
         pairs,
         a=tuple(names[pair.a] for pair in pairs),
         b=tuple(names[pair.b] for pair in pairs),
-        overlap=network.overlap,
-        used=np.array(network.used, bool),
-        reasons=tuple(network.pair_reasons),
-        shared=np.array([pair.pieces for pair in pairs], np.int64),
         T_a_b=np.array(
             [
                 rigid.with_origin(rigid.transform(np.eye(3), origins[pair.a]) @ pair.T_a_b, origins[pair.b])
@@ -247,17 +233,13 @@ def _pairs(names: Sequence[str], network: Network) -> Pairs:
         covariance=np.array(
             [rigid.about_origin(pair.covariance[:6, :6], pair.T_a_b[:3, 3] + origins[pair.a]) for pair in pairs]
         ),
-        scale=network.scale if len(network.scale) else unknown,
-        scale_sd=network.scale_sd if len(network.scale_sd) else unknown,
         from_frame=tuple(_socs(names[pair.b]) for pair in pairs),
         to_frame=tuple(_socs(names[pair.a]) for pair in pairs),
     )
 
 
 def _closures(names: Sequence[str], network: Network) -> Closures:
-    used = [pair for pair, is_used in zip(network.pairs, network.used, strict=True) if is_used]
-    weights = np.array([1.0 / max(float(np.trace(pair.covariance[3:6, 3:6])), 1e-12) for pair in used])
-    loops = pairs_and_loops.loops(used, weights, len(names)) if used else []
+    loops = pairs_and_loops.loops([pair for pair in network.pairs if pair.used], len(names))
     return Closures.from_items(loops, loop=tuple(tuple(names[i] for i in loop.rows) for loop in loops))
 
 

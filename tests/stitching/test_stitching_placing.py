@@ -142,7 +142,7 @@ def test_closures_run_over_the_pairs_that_are_known_best():
         Pair(a, b, 9, along(6000.0 * (b - a)), np.diag([1e-12] * 3 + [each**2] * 3), 1.0, 1.0)
         for (a, b), each in sd.items()
     ]
-    found = to_result._closures("ABCD", SimpleNamespace(pairs=pairs, used=[True] * 5))
+    found = to_result._closures("ABCD", SimpleNamespace(pairs=pairs))
     assert [sorted(set(loop)) for loop in found.loop] == [["A", "C", "D"], ["A", "B", "C", "D"]]
 
 

@@ -37,6 +37,14 @@ class CoarsePoses:
     contrary: Floats
     overlap: Floats
 
+    @classmethod
+    def unrivalled(cls, T: Floats) -> CoarsePoses:
+        """Return poses that nothing is known against."""
+        k = len(T)
+        return cls(
+            T=T, rivalry=np.zeros(k), T_rival=np.full((k, 4, 4), np.nan), contrary=np.zeros(k), overlap=np.ones(k)
+        )
+
 
 @dataclass(frozen=True)
 class Network:
@@ -176,7 +184,11 @@ def rated(network: Network, reference: int) -> CoarsePoses:
         network = replace(network, still=network.still_with((), ()))
         coarse = _rated(network, reference)
         moves = _moves(network, coarse, reference)
-    return _with_moves(coarse, moves)
+    for move in moves:  # rivals of the poses of all scans that move
+        for s in move.scans:
+            if move.ratio > coarse.rivalry[s]:
+                coarse.rivalry[s], coarse.T_rival[s] = move.ratio, move.M @ coarse.T[s]
+    return coarse
 
 
 @dataclass(frozen=True)
@@ -242,16 +254,6 @@ def _followers(network: Network, i: int, j: int, M: Floats) -> Move:
     return Move(scans=moving, M=M, ratio=best)
 
 
-def _with_moves(coarse: CoarsePoses, moves: list[Move]) -> CoarsePoses:
-    """Enter motions of groups of scans as rivals of the poses of all scans that move."""
-    rivalry, T_rival = coarse.rivalry.copy(), coarse.T_rival.copy()
-    for move in moves:
-        for s in move.scans:
-            if move.ratio > rivalry[s]:
-                rivalry[s], T_rival[s] = move.ratio, move.M @ coarse.T[s]
-    return replace(coarse, rivalry=rivalry, T_rival=T_rival)
-
-
 def _most_certain(network: Network) -> tuple[int, Floats] | None:
     """Return the scan whose best pose leads the next best one by the largest score, and this pose."""
     best: tuple[int, Floats] | None = None
@@ -268,9 +270,7 @@ def _most_certain(network: Network) -> tuple[int, Floats] | None:
 
 def _rated(network: Network, reference: int) -> CoarsePoses:
     """Compare each placed scan's pose with its competitors, beside all other placed scans."""
-    T, k = network.T, len(network.scans)
-    rivalry, T_rival = np.zeros(k), np.full((k, 4, 4), np.nan)
-    contrary, overlap = np.zeros(k), np.ones(k)
+    T, coarse = network.T, CoarsePoses.unrivalled(network.T)
     for j in network.placed:
         others = [i for i in network.placed if i != j]
         if j == reference or not others:
@@ -280,13 +280,13 @@ def _rated(network: Network, reference: int) -> CoarsePoses:
         best = next((score for score, pose in ranked if network.same(pose, T[j], j)), 0.0)
         rivals = [(score, pose) for score, pose in ranked if not network.same(pose, T[j], j)]
         if rivals:
-            rivalry[j] = rivals[0][0] / max(best, 1e-12)
-            T_rival[j] = rivals[0][1]
+            coarse.rivalry[j] = rivals[0][0] / max(best, 1e-12)
+            coarse.T_rival[j] = rivals[0][1]
         scored = [network.score_beside(i, j, T[j]) for i in others]
         agree = sum(pose.agree for pose in scored if pose.overlap > LEAST_OVERLAP)
-        contrary[j] = sum(pose.against for pose in scored) / max(agree, 1e-12)
-        overlap[j] = max(pose.overlap for pose in scored)
-    return CoarsePoses(T=T, rivalry=rivalry, T_rival=T_rival, contrary=contrary, overlap=overlap)
+        coarse.contrary[j] = sum(pose.against for pose in scored) / max(agree, 1e-12)
+        coarse.overlap[j] = max(pose.overlap for pose in scored)
+    return coarse
 
 
 def rank_poses(network: Network, j: int, others: list[int], current: Floats | None = None) -> RankedPoses:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from processor.geometry import rigid
-from processor.model import Floats, Ints
+from processor.model import Columns, Floats, Ints
 from processor.stitching.fine.bundle_adjustment import Solution
 from processor.stitching.fine.correspondences import FACE_END, Blocks
 from processor.stitching.planes import extraction, grouped_sums
@@ -38,7 +38,7 @@ LEAST_RATE = 0.1  # shift of an end across its piece, by the size of the motion
 
 
 @dataclass(frozen=True)
-class Matches:
+class Matches(Columns):
     """Ends (n, 3) of scans (n,), in their clouds' frames, on pieces (n,) that bound them.
 
     ``off`` (n,) is how far beyond the piece each lies, ``width`` (n,) the distance between its two rays, both across
@@ -99,7 +99,7 @@ def match(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float, clear:
     towards = np.einsum("ni,ni->n", planes.normal, T[blocks.scan[first], :3, 3] - planes.mean)
     normal = planes.normal * np.where(towards < 0.0, -1.0, 1.0)[:, None]
     half = REACH * np.sqrt(planes.variance[:, 1:]) + 2.0 * clouds[0].cell_mm
-    parts = [Matches()]
+    parts = list[Matches]()
     for s, cloud in enumerate(clouds):
         if not len(cloud.ends.points) or not np.isfinite(T[s]).all():
             continue
@@ -113,7 +113,7 @@ def match(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float, clear:
                     normal=normal[piece], gap=cloud.ends.gap[rows], edge=cloud.ends.edge[rows],
                 )
             )  # fmt: skip
-    return Matches(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Matches)})
+    return Matches.concat(parts)
 
 
 def _match_scan(

@@ -9,12 +9,13 @@ from scipy.special import chdtri
 
 from processor.adjustment import scanner_class_errors
 from processor.geometry import rigid
-from processor.model import Floats
+from processor.model import Floats, Reason
 from processor.stitching import poses_with_scale
 from processor.stitching.fine import bundle_adjustment, direction_errors
 from processor.stitching.fine.bundle_adjustment import Solution
 from processor.stitching.fine.correspondences import ON_PIECE, Blocks
 
+NAN = float("nan")
 LEAST_PIECES = 6  # of a pair: as many as a pose's unknowns
 GROSS_PROBABILITY = 1e-6  # that a sound pair is called gross: networks have up to some thousand pairs
 
@@ -25,11 +26,16 @@ class Pair:
 
     a: int
     b: int
-    pieces: int
+    shared: int  # pieces, or points
     T_a_b: Floats  # with the scale of b in a where that is free
     covariance: Floats  # (6, 6), with a free scale (7, 7); along the axes of a, rotation about the origin of b
     residual: float
-    chi2: float  # of its difference from the network's pose
+    chi2: float = 0.0  # of its difference from the network's pose
+    overlap: float = NAN
+    used: bool = True
+    reasons: tuple[Reason, ...] = ()
+    scale: float = NAN  # by picks alone, of b in a
+    scale_sd: float = NAN
 
     @property
     def is_gross(self) -> bool:
@@ -68,19 +74,17 @@ def register_pair(blocks: Blocks, network: Solution, a: int, b: int, variance: f
     weight = local.sums[points, 9]
     residual = float(np.sqrt((weight * solution.offset[points] ** 2).sum() / max(weight.sum(), 1e-12)))
     return Pair(
-        a=a, b=b, pieces=local.pieces, T_a_b=solution.T[1], covariance=covariance, residual=residual,
+        a=a, b=b, shared=local.pieces, T_a_b=solution.T[1], covariance=covariance, residual=residual,
         chi2=float(d @ np.linalg.solve(expected, d)),
     )  # fmt: skip
 
 
-def loops(pairs: list[Pair], weights: Floats, count: int) -> list[Loop]:
-    """Return the loops that pairs close over the maximum spanning tree by weight, with their misclosures."""
-    order = np.argsort(-weights, kind="stable")
+def loops(pairs: list[Pair], count: int) -> list[Loop]:
+    """Return the loops that pairs close over the tree of those whose shifts are known best, with their misclosures."""
     group = list(range(count))
     tree: dict[int, list[tuple[int, Pair]]] = {i: [] for i in range(count)}
     rest = []
-    for row in order:
-        pair = pairs[row]
+    for pair in sorted(pairs, key=lambda pair: float(np.trace(pair.covariance[3:6, 3:6]))):
         if group[pair.a] != group[pair.b]:
             old, new = group[pair.b], group[pair.a]
             group = [new if g == old else g for g in group]

@@ -7,14 +7,14 @@ with the distance of the two rays on the face as the width of a uniform distribu
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
 
 from processor import large_arrays
 from processor.geometry.scan_grid_directions import Rays
-from processor.model import Floats, Ints
+from processor.model import Columns, Floats, Ints
 from processor.stitching.planes.extraction import Planes
 from processor.stitching.planes.grid_bands import GridBands, Window
 
@@ -26,7 +26,7 @@ WIDEST = 0.02  # of the range: ends between rays farther apart than this on the 
 
 
 @dataclass(frozen=True)
-class Ends:
+class Ends(Columns):
     """Ends (n, 3) in the cloud's frame, the step from ray to ray at each (n, 3), and the faces' normals (n, 3).
 
     ``gap`` (n,) numbers the two rows or columns of the scan grid that an end lies between, ``edge`` (n,) the face
@@ -64,8 +64,7 @@ def ends_of(bands: GridBands, piece_of_cell: Ints, planes: Planes, sigma_mm: flo
     for window in bands.windows():
         for number, of_direction in enumerate(parts):
             of_direction.append(_ends_in(window, on_face[window.rows], number, planes, sigma_mm, rays))
-    found = [part for of_direction in parts for part in of_direction]
-    return Ends(**{f.name: np.concatenate([getattr(part, f.name) for part in found]) for f in fields(Ends)})
+    return Ends.concat([part for of_direction in parts for part in of_direction])
 
 
 def _ends_in(window: Window, on_face: Ints, number: int, planes: Planes, sigma_mm: float, rays: Rays) -> Ends:
