@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from os import PathLike
@@ -11,11 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from processor.model import InputError, UsageError, did_you_mean
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from processor.plain_text import tomllib
 
 Recipe = dict[str, Any]
 

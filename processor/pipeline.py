@@ -23,15 +23,11 @@ import processor
 from processor import diagnostics, user_methods
 from processor.model import InputError, Reason, Scan, Scene, Status, StepRun, UsageError, did_you_mean, inputs, reason
 from processor.model.doubted import doubted
+from processor.plain_text import tomllib
 from processor.progress import stage
 from processor.store import epoch
 from processor.store.json_values import json_ready
 from processor.version import __version__
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 PIECEWISE_POINTS = 5_000_000  # work, not result: 5 million points are 120 MB, and steps hold several times as much
 SAMPLED_TILES = 64  # of all scans of a scene file, a million points: where these are used once, all are

@@ -1,4 +1,4 @@
-"""Text of unknown encoding, and text that a terminal or a spreadsheet shows and does not obey.
+"""Text of unknown encoding, text that a terminal or a spreadsheet shows and does not obey, and the reader of TOML.
 
 processor and designgen share it.
 """
@@ -6,6 +6,14 @@ processor and designgen share it.
 from __future__ import annotations
 
 import re
+import sys
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+__all__ = ["decoded", "printable", "spreadsheet_text", "tomllib"]
 
 FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")  # first characters of cells that a spreadsheet would execute
 

@@ -18,19 +18,13 @@ from __future__ import annotations
 import importlib.resources
 import math
 import string
-import sys
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
 from processor.model import Reason, Word
-from processor.plain_text import printable
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from processor.plain_text import printable, tomllib
 
 CODES = ("en", "zh")
 LIST = {"en": ", ", "zh": "、"}

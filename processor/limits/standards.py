@@ -5,7 +5,6 @@ Most rows are not verified, and verdicts that depend on them are marked. Limits 
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from importlib import resources
@@ -13,11 +12,7 @@ from typing import Any
 
 from processor import record_checks
 from processor.model import InputError, Limit, Tolerance, did_you_mean
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from processor.plain_text import tomllib
 
 DEFAULT = "GB 50205-2020"
 NAN = float("nan")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import datetime
 import math
-import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, make_dataclass
 from functools import cache
@@ -19,11 +18,7 @@ import numpy as np
 
 from processor.model.fields import LONG, NUMBER, Checked, Fault, Floats, Meaning, column, described, names
 from processor.model.inputs import NOTHING, Kind, Place, entry, number, read, text
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from processor.plain_text import tomllib
 
 ASSUMED = "phase"  # where nobody says what the scanner was
 

@@ -1,8 +1,7 @@
-"""Colours of points: found by the names of columns, and brought to 8 bits."""
+"""Colours of points, brought to 8 bits."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,18 +9,9 @@ import numpy as np
 
 from processor import large_arrays
 from processor.model import Codes
-from processor.readers.columns import first_named
-from processor.readers.raw_scan import RawScan
 
-NAMES = (r"(diffuse_)?r(ed)?", r"(diffuse_)?g(reen)?", r"(diffuse_)?b(lue)?")
 MOST = 255  # of 8 bits
 STEP = 256  # of 16 bits a step of 8 bits
-
-
-def named(columns: Any) -> list[str]:
-    """Return the names of the columns red, green and blue; none unless there are all three."""
-    found = [first_named(columns, pattern) for pattern in NAMES]
-    return [name for name in found if name is not None] if all(found) else []
 
 
 def of_columns(columns: Sequence[Any]) -> Codes:
@@ -46,12 +36,6 @@ def of_columns(columns: Sequence[Any]) -> Codes:
             parts = [np.asarray(part, np.float32) // STEP for part in parts]
         colour[rows] = scaled(parts, 0.0, float(MOST))
     return colour
-
-
-def coloured(scan: RawScan, columns: Sequence[Any]) -> RawScan:
-    """Return a scan with the colours of columns (n,) red, green and blue, see :func:`of_columns`."""
-    colour = of_columns(columns)
-    return dataclasses.replace(scan, colour=colour) if len(colour) else scan
 
 
 def scaled(columns: Sequence[Any], low: float, high: float) -> Codes:

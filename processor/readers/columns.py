@@ -11,10 +11,15 @@ import numpy as np
 
 import processor.readers.pieces as progress_of
 from processor import column_names
+from processor.large_arrays import allocate
 from processor.model import Floats, InputError
+from processor.readers.colours import of_columns
 
-INTENSITY_NAMES = r"(scalar_)?(intensity|reflectance|reflectivity|amplitude)|i"
-STATION_NAMES = r"(scalar_)?station"
+OTHERS = {  # names of columns that are not coordinates
+    "intensity": r"(scalar_)?(intensity|reflectance|reflectivity|amplitude)|i",
+    "station": r"(scalar_)?station",
+}
+COLOURS = {"red": r"(diffuse_)?r(ed)?", "green": r"(diffuse_)?g(reen)?", "blue": r"(diffuse_)?b(lue)?"}
 PIECE_BYTES = 1 << 19  # fits in the cache of a processor core between the passes over it
 
 
@@ -23,15 +28,30 @@ def first_named(columns: Any, pattern: str) -> str | None:
     return next((name for name in columns if re.fullmatch(pattern, name, re.IGNORECASE)), None)
 
 
-class Axes(NamedTuple):
-    """Which columns are x, y and z, counted from 0, and the unit that their names give, "" for none."""
+class Wanted(NamedTuple):
+    """Columns that a scan is made of, counted from 0: x, y and z, then ``others`` (of OTHERS and COLOURS).
 
-    columns: tuple[int, int, int]
-    unit: str
+    ``unit`` is that which the names of coordinates give, "" for none.
+    """
+
+    columns: tuple[int, ...]
+    others: tuple[str, ...] = ()
+    unit: str = ""
+
+    def room(self, count: int) -> list[Any]:
+        """Return arrays for ``count`` rows: coordinates (n, 3), then a column (n,) for each of the others."""
+        types = (np.float32 if name in COLOURS else np.float64 for name in self.others)
+        return [allocate(count, 3), *(allocate(count, dtype=dtype) for dtype in types)]
+
+    def fields(self, others: Iterable[Any]) -> dict[str, Any]:
+        """Return the fields of a scan, but for its coordinates, from the columns (n,) of the others."""
+        found = dict(zip(self.others, others, strict=True))
+        colour = of_columns([found.pop(name) for name in COLOURS if name in found])
+        return {"unit": self.unit, "colour": colour, **found}
 
 
-def axes(path: Path, names: Sequence[str]) -> Axes | None:
-    """Return the columns of coordinates by their names, None where these do not name all three.
+def wanted(path: Path, names: Sequence[str], colours: bool = True) -> Wanted | None:
+    """Return the columns to be read by their names, None where these do not name x, y and z; colours are three or none.
 
     Raises InputError for two columns of one axis, and for coordinates in different units.
     """
@@ -43,7 +63,12 @@ def axes(path: Path, names: Sequence[str]) -> Axes | None:
         return None
     if len(set(named.units)) != 1:
         raise InputError(f"expected x, y, z in one unit, found different units ({', '.join(names)[:120]})", path=path)
-    return Axes(named.columns, named.units[0])
+    found = {key: first_named(names, pattern) for key, pattern in (OTHERS | COLOURS).items()}
+    used = {key: names.index(name) for key, name in found.items() if name is not None}
+    places = [used.get(key, -1) for key in COLOURS]
+    if not colours or min(places) < 0 or {*places} & {*named.columns}:
+        used = {key: place for key, place in used.items() if key in OTHERS}
+    return Wanted((*named.columns, *used.values()), tuple(used), named.units[0])
 
 
 def columns_of_records(file: BinaryIO, dtype: Any, wanted: Sequence[str], count: int) -> Iterator[Sequence[Any]]:

@@ -40,7 +40,7 @@ def unit(vlrs: Sequence[Any], fits_degrees: bool) -> tuple[str, Reason | None]:
         units += [*_units_of_keys(keys, doubles), *_units_of_wkt(plane)]
         of_wkt = _last_unit(vertical[0]) if vertical else ""
         heights = heights or EPSG_UNITS.get(keys.get(VERTICAL_UNIT_KEY, 0), "")
-        heights = heights or epsg_units.vertical(keys.get(VERTICAL_SYSTEM_KEY, 0))
+        heights = heights or epsg_units.unit("vertical", keys.get(VERTICAL_SYSTEM_KEY, 0))
         heights = heights or (of_wkt if isinstance(of_wkt, str) else "")
     horizontal = next((one for one in units if isinstance(one, str)), "")
     if units and not horizontal:
@@ -61,7 +61,7 @@ def _units_of_keys(keys: Mapping[int, int], doubles: Sequence[float]) -> Iterato
     elif code:
         yield reason("units.file-code-unknown", code=code)
     elif system not in (0, USER_DEFINED):
-        yield epsg_units.horizontal(system) or reason("units.file-code-unknown", code=system)
+        yield epsg_units.unit("horizontal", system) or reason("units.file-code-unknown", code=system)
     elif keys.get(OTHER_UNIT_KEY) in EPSG_UNITS:
         yield EPSG_UNITS[keys[OTHER_UNIT_KEY]]
 
@@ -75,7 +75,7 @@ def _units_of_wkt(plane: str) -> Iterator[str | Reason]:
     if last or not codes:
         yield last or reason("units.file-unit-missing")
     else:
-        yield epsg_units.horizontal(int(codes[-1])) or reason("units.file-code-unknown", code=int(codes[-1]))
+        yield epsg_units.unit("horizontal", int(codes[-1])) or reason("units.file-code-unknown", code=int(codes[-1]))
 
 
 def _last_unit(wkt: str) -> str | Reason:

@@ -6,7 +6,6 @@ the scanner's grid, if the scan has both.
 
 from __future__ import annotations
 
-import dataclasses
 import datetime
 import re
 import struct
@@ -154,18 +153,19 @@ def _read_scan(path: Path, file: Any, index: int, scan_names: Sequence[str]) -> 
     # Writers give single and merged clouds an identity pose too, so it is no evidence of a scanner's position.
     posed = pose.size > 0 and (len(scan_names) > 1 or bool((pose != np.eye(4)).any()))
     node = libe57.StructureNode(header.points.prototype())[axes[0]]
-    scan = build_scan(
+    return build_scan(
         path,
         name,
         points,
         unit=UNIT,
         intensity=intensity,
-        position=np.zeros(3) if posed else (),
+        colour=colour,
+        position=np.zeros(3 if posed else 0),
         T_project_scan=pose,
-        grid=(cells[0], cells[1]) if cells else None,
+        scanned=_day(file, header),
         single=isinstance(node, libe57.FloatNode) and node.precision() == libe57.E57_SINGLE,
+        **dict(zip(("grid_row", "grid_column"), cells, strict=False)),
     )
-    return dataclasses.replace(scan, colour=colour if len(colour) else scan.colour, scanned=_day(file, header))
 
 
 def _day(file: Any, header: Any) -> str:

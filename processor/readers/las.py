@@ -5,7 +5,6 @@ Points flagged as withheld, which means deleted (LAS 1.4 R15, table 9), are left
 
 from __future__ import annotations
 
-import dataclasses
 import struct
 from pathlib import Path
 
@@ -15,7 +14,7 @@ import processor.readers.coordinate_system as coordinate_system
 import processor.readers.pieces as pieces
 from processor.large_arrays import allocate
 from processor.model import InputError, reason
-from processor.readers.colours import coloured
+from processor.readers.colours import of_columns
 from processor.readers.file_checks import check_declared_points, errors_name_the_file
 from processor.readers.raw_scan import RawScan, build_scan, scan_name
 
@@ -84,21 +83,19 @@ def read(path: Path) -> list[RawScan]:
         raise InputError(f"expected {declared} points as declared, found {read}; copy it again", path=path)
     if read and not count:
         raise InputError(f"all of its {read} points are flagged as withheld, which means deleted", path=path)
-    # 0 in all points: the stations are unknown.
-    name, stations = scan_name(path), station[:count] if named else ()
-    scan = build_scan(path, name, points[:count], unit=unit, intensity=intensity[:count], station=stations)
+    name = scan_name(path)
     remarks = [
         reason("read.withheld-points", count=read - count, scans=(name,)),
         reason("read.synthetic-points", count=synthetic, scans=(name,)),
     ]
     return [
-        dataclasses.replace(
-            coloured(scan, [column[:count] for column in colour]),
-            scanned=day,
-            unit_fault=fault,
+        build_scan(
+            path, name, points[:count], unit=unit, unit_fault=fault, scanned=day, intensity=intensity[:count],
+            station=station[:count] if named else (),  # 0 in all points: unknown
+            colour=of_columns([column[:count] for column in colour]),
             remarks=tuple(one for one in remarks if one.values["count"]),
         )
-    ]
+    ]  # fmt: skip
 
 
 def _check_header(path: Path) -> None:

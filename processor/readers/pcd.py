@@ -17,17 +17,9 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from processor import large_arrays
-from processor.large_arrays import allocate
 from processor.model import Floats, InputError
 from processor.readers.ascii_rows import Rows
-from processor.readers.columns import (
-    INTENSITY_NAMES,
-    STATION_NAMES,
-    axes,
-    columns_of_records,
-    fill_columns,
-    first_named,
-)
+from processor.readers.columns import columns_of_records, fill_columns, wanted
 from processor.readers.file_checks import check_declared_points, errors_name_the_file
 from processor.readers.raw_scan import RawScan, build_scan, scan_name
 
@@ -56,13 +48,10 @@ class Header:
 def read(path: Path) -> list[RawScan]:
     """Read a PCD file as one scan."""
     header = read_header(path)
-    names, count = header.names, header.points
-    named = axes(path, names)
-    if named is None:
-        raise InputError(f"expected FIELDS with x, y, z, found {' '.join(names)}", path=path)
-    intensity, station = first_named(names, INTENSITY_NAMES), first_named(names, STATION_NAMES)
-    fields = [*named.columns, *(names.index(name) for name in (intensity, station) if name)]
-    columns = [allocate(count, 3), *(allocate(count) for _ in fields[3:])]
+    count, read = header.points, wanted(path, header.names, colours=False)
+    if read is None:
+        raise InputError(f"expected FIELDS with x, y, z, found {' '.join(header.names)}", path=path)
+    fields, columns = read.columns, read.room(count)
     with errors_name_the_file(path, "PCD"), path.open("rb") as file:
         file.seek(header.start)
         if header.data == "ascii":
@@ -79,10 +68,8 @@ def read(path: Path) -> list[RawScan]:
             path,
             scan_name(path),
             columns[0][:returns],
-            unit=named.unit,
-            intensity=columns[1][:returns] if intensity else (),
-            station=columns[-1][:returns] if station else (),
             single=header.data != "ascii" and header.types[fields[0]] == "<f4",
+            **read.fields(column[:returns] for column in columns[1:]),
         )
     ]
 

@@ -15,19 +15,9 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from processor.large_arrays import allocate
 from processor.model import InputError
 from processor.readers.ascii_rows import Rows
-from processor.readers.colours import coloured
-from processor.readers.colours import named as colours_named
-from processor.readers.columns import (
-    INTENSITY_NAMES,
-    STATION_NAMES,
-    axes,
-    columns_of_records,
-    fill_columns,
-    first_named,
-)
+from processor.readers.columns import columns_of_records, fill_columns, wanted
 from processor.readers.file_checks import check_declared_points, errors_name_the_file
 from processor.readers.raw_scan import RawScan, build_scan, scan_name
 
@@ -70,39 +60,26 @@ def read(path: Path) -> list[RawScan]:
     vertex = next((element for element in header.elements if element.name == "vertex"), _Element("vertex", 0))
     before = header.elements[: header.elements.index(vertex)] if vertex in header.elements else []
     names = list(vertex.types)
-    named = axes(path, names)
-    if named is None:
+    read = wanted(path, names)
+    if read is None:
         raise InputError(f"expected vertices with x, y, z, found {', '.join(names) or 'none'}", path=path)
     if vertex.list_counts:
         raise InputError("expected vertices without lists, found lists within them; export points only", path=path)
-    intensity, station = first_named(vertex.types, INTENSITY_NAMES), first_named(vertex.types, STATION_NAMES)
-    wanted = [*(names[i] for i in named.columns), *(name for name in (intensity, station) if name)]
-    columns = [allocate(vertex.count, 3), *(allocate(vertex.count) for _ in wanted[3:])]
-    colours = [name for name in colours_named(vertex.types) if name not in wanted]
-    colour = [allocate(vertex.count, dtype=np.float32) for _ in colours]
-    every, read = [*columns, *colour], [*wanted, *colours]
+    columns, used = read.room(vertex.count), [names[i] for i in read.columns]
     with errors_name_the_file(path, "PLY"), path.open("rb") as file:
         file.seek(header.start)
         if header.order:
             dtype = np.dtype([(name, header.order + code) for name, code in vertex.types.items()])
             for element in before:
                 _skip(file, element, header.order)
-            fill_columns(every, columns_of_records(file, dtype, read, vertex.count))
+            fill_columns(columns, columns_of_records(file, dtype, used, vertex.count))
         else:
             rows = Rows(file)
             for _ in range(sum(element.count for element in before)):
                 rows.skip_line()
-            fill_columns(every, rows.pieces([names.index(name) for name in read], vertex.count, len(names)))
-    scan = build_scan(
-        path,
-        scan_name(path),
-        columns[0],
-        unit=named.unit,
-        intensity=columns[1] if intensity else (),
-        station=columns[-1] if station else (),
-        single=bool(header.order) and vertex.types[wanted[0]] == "f4",
-    )
-    return [coloured(scan, colour)]
+            fill_columns(columns, rows.pieces(read.columns, vertex.count, len(names)))
+    single = bool(header.order) and vertex.types[used[0]] == "f4"
+    return [build_scan(path, scan_name(path), columns[0], single=single, **read.fields(columns[1:]))]
 
 
 def _skip(file: BinaryIO, element: _Element, order: str) -> None:

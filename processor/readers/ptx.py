@@ -48,13 +48,10 @@ def read(path: Path) -> list[RawScan]:
     if not scans and not empty:
         raise InputError("expected scans, found none", path=path)
     if len(scans) + len(empty) == 1:
-        scans, empty = [_renamed(scan, scan_name(path)) for scan in scans], [scan_name(path) for _ in empty]
+        name = scan_name(path)
+        remarks = tuple(reason(one.code, count=1, scans=(name,)) for scan in scans for one in scan.remarks)
+        scans, empty = [dataclasses.replace(scan, name=name, remarks=remarks) for scan in scans], [name for _ in empty]
     return without_empty(path, scans, empty)
-
-
-def _renamed(scan: RawScan, name: str) -> RawScan:
-    remarks = tuple(reason(one.code, count=1, scans=(name,)) for one in scan.remarks)
-    return dataclasses.replace(scan, name=name, remarks=remarks)
 
 
 def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> RawScan | None:
@@ -103,18 +100,19 @@ def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> Ra
     if not count:
         return None
     name = f"{scan_name(path)}-{number}"
-    scan = build_scan(
+    return build_scan(
         path,
         name,
         points[:count],
         unit=UNIT,
-        intensity=intensity[: count if wide else 0],
+        intensity=intensity[:count],
+        colour=colour[:count],
         position=_scanner(np.array(numbers[2]), T_project_scan, points[:count]),
         T_project_scan=T_project_scan,
-        grid=(row[:count], column[:count]) if gridded else None,
+        grid_row=row[:count],
+        grid_column=column[:count],
+        remarks=(reason("read.matrix-for-columns", count=1, scans=(name,)),) if for_columns else (),
     )
-    remarks = (reason("read.matrix-for-columns", count=1, scans=(name,)),) if for_columns else ()
-    return dataclasses.replace(scan, colour=colour[:count] if len(colour) else scan.colour, remarks=remarks)
 
 
 def _scanner(stated: Floats, T_project_scan: Floats, points: Floats) -> Floats:

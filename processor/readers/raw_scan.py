@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from processor import large_arrays
 from processor.model import Checked, Codes, Floats, InputError, Ints, Labels, Reason, column, optional, reason
-from processor.readers.encoding import file_name_as_text
+from processor.plain_text import decoded
 
 FAR = 10_000.0  # units; an origin is subtracted from coordinates beyond this
 ORIGIN_STEP = 1_000.0  # units: round numbers, so that people and other software recognise the origin
@@ -42,6 +44,15 @@ class RawScan(Checked):
     step: float = 0.0  # resolution of the coordinates in the file's number type; 0 = unlimited
 
 
+def file_name_as_text(name: str) -> str:
+    """Return the name of a file as text, decoded as GB18030 where it is not UTF-8."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return decoded(os.fsencode(name))
+    return name
+
+
 def scan_name(path: Path) -> str:
     """Return the name of a file's scan: the name of the file without suffix, as text."""
     return file_name_as_text(path.stem) or "scan"
@@ -52,18 +63,15 @@ def build_scan(
     name: str,
     points: Floats,
     *,
-    unit: str,
     intensity: npt.ArrayLike = (),
-    position: npt.ArrayLike = (),
-    T_project_scan: npt.ArrayLike = (),
     station: npt.ArrayLike = (),
-    grid: tuple[Labels, Labels] | None = None,
     single: bool = False,
+    **fields: Any,
 ) -> RawScan:
     """Build the record from coordinates (n, 3); an origin of whole thousands is subtracted in place where they are far.
 
-    ``grid``: rows and columns (n,) of the scanner's grid. ``single``: coordinates are 32-bit floats in the file. Raises
-    InputError without points, and for coordinates that are not finite.
+    ``single``: coordinates are 32-bit floats in the file; ``fields``: others of the record. Raises InputError without
+    points, and for coordinates that are not finite.
     """
     if not len(points):
         raise InputError(f"scan {name!r} holds no points; export it again", path=path)
@@ -90,13 +98,9 @@ def build_scan(
         points,
         origin,
         intensity=large_arrays.contiguous(intensity, np.float64),
-        position=np.asarray(position, np.float64),
-        T_project_scan=np.asarray(T_project_scan, np.float64),
-        unit=unit,
         station=large_arrays.contiguous(station, np.int64),
-        grid_row=grid[0] if grid else np.empty(0, np.int32),
-        grid_column=grid[1] if grid else np.empty(0, np.int32),
         step=step,
+        **fields,
     )
 
 

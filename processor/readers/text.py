@@ -23,9 +23,7 @@ from processor.large_arrays import allocate
 from processor.model import Floats, InputError
 from processor.plain_text import decoded
 from processor.readers.ascii_rows import Rows
-from processor.readers.colours import coloured
-from processor.readers.colours import named as colours_named
-from processor.readers.columns import INTENSITY_NAMES, STATION_NAMES, axes, first_named
+from processor.readers.columns import COLOURS, Wanted, wanted
 from processor.readers.file_checks import check_declared_points, check_last_row, errors_name_the_file
 from processor.readers.raw_scan import RawScan, build_scan, scan_name
 
@@ -66,18 +64,14 @@ def read(path: Path) -> list[RawScan]:
     """Read a table of points as one scan, or a PTS file of several scans, each after its number of points."""
     layout = sniff(path)
     check_last_row(path, "text")
-    columns = _columns(path, layout)
-    wanted = [*columns.axes, *(index for index in (columns.intensity, columns.station) if index is not None)]
-    colours = [len(wanted) - 3 + i for i in range(len(columns.colour))]
-    station = len(wanted) - 4
-    wanted += columns.colour
+    read = _columns(path, layout)
     size = path.stat().st_size
     tables, declared = [], layout.declared
     with errors_name_the_file(path, "text"), _opened(path, layout) as file:
         rows = _rows(file, layout)
         while True:
             check_declared_points(path, "text", max(declared, 0), SHORTEST_ROW, size)
-            tables.append(_filled(rows, wanted, declared, layout.width))
+            tables.append(_filled(rows, read.columns, declared, layout.width))
             following = rows.line()
             if following is None or declared < 0:
                 break
@@ -86,17 +80,7 @@ def read(path: Path) -> list[RawScan]:
             declared = int(following)
     names = [scan_name(path)] if len(tables) == 1 else [f"{scan_name(path)}-{i}" for i in range(1, len(tables) + 1)]
     return [
-        coloured(
-            build_scan(
-                path,
-                name,
-                points,
-                unit=columns.unit,
-                intensity=others[:, 0] if columns.intensity is not None else (),
-                station=others[:, station] if columns.station is not None else (),
-            ),
-            [others[:, i] for i in colours],
-        )
+        build_scan(path, name, points, **read.fields(others.T))
         for name, (points, others) in zip(names, tables, strict=True)
     ]
 
@@ -229,8 +213,8 @@ class _Before:
         # Bytes that are not UTF-8 were read as Chinese.
         latin = () if text.isascii() else _header_cells(text.encode("gb18030", "replace").decode("latin-1"))
         for names in (self.last, latin):
-            if named := axes(path, names):
-                self.coordinates, self.axes = names, named.columns
+            if named := wanted(path, names):
+                self.coordinates, self.axes = names, named.columns[:3]
                 return
 
     def is_row(self, cells: Sequence[str]) -> bool:
@@ -298,24 +282,12 @@ def _is_number(cell: str) -> bool:
     return "_" not in cell
 
 
-@dataclass(frozen=True)
-class _Columns:
-    axes: Sequence[int]
-    intensity: int | None = None
-    station: int | None = None
-    unit: str = ""
-    colour: Sequence[int] = ()
-
-
-def _columns(path: Path, layout: Layout) -> _Columns:
-    """Return the columns of coordinates, intensity and station, and the unit that a header names."""
+def _columns(path: Path, layout: Layout) -> Wanted:
+    """Return the columns that the header names, else those by their number."""
     names = layout.header
-    named = axes(path, names)
+    named = wanted(path, names)
     if named and len(names) == layout.columns:
-        others = [first_named(names, pattern) for pattern in (INTENSITY_NAMES, STATION_NAMES)]
-        intensity, station = (names.index(name) if name else None for name in others)
-        colour = [names.index(name) for name in colours_named(names)]
-        return _Columns(named.columns, intensity, station, named.unit, colour)
+        return named
     # A line of other words is a title or a remark.
     likely = 2 * column_names.count_known(names) > len(names) > 1
     if len(names) != layout.columns and (named or likely):
@@ -329,7 +301,8 @@ def _columns(path: Path, layout: Layout) -> _Columns:
             f"expected columns x, y, z or Easting, Northing, Height, found {', '.join(names)[:120]}{advice}", path=path
         )
     _check_plain(path, layout)
-    return _Columns([0, 1, 2], 3 if layout.columns in (4, 7) else None, colour=(4, 5, 6) if layout.columns == 7 else ())
+    others = {4: ("intensity",), 7: ("intensity", *COLOURS)}.get(layout.columns, ())
+    return Wanted(tuple(range(3 + len(others))), others)
 
 
 def _check_plain(path: Path, layout: Layout) -> None:

@@ -35,8 +35,7 @@ from processor.model import (
 from processor.model.inputs import Place, read, shown
 from processor.progress import tracked
 from processor.readers import RawScan
-from processor.readers.encoding import file_name_as_text
-from processor.readers.raw_scan import scaled_in_place, scan_name, summed
+from processor.readers.raw_scan import file_name_as_text, scaled_in_place, scan_name, summed
 from processor.scan_folder import guess, node_list, scanner_grid, units
 from processor.scan_folder.clips import FEWEST_POINTS, Clipper
 from processor.scan_folder.control_points import control_points, read_control

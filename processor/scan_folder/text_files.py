@@ -4,19 +4,12 @@ from __future__ import annotations
 
 import csv
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
 from processor.model import InputError
-from processor.plain_text import decoded
+from processor.plain_text import decoded, tomllib
 from processor.readers.file_checks import errors_name_the_file
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
 
 TEXT_BYTES = 32 * 2**20  # a design of 100,000 nodes has a third of it; JSON of empty lists takes 25 times as much
 TOML_BYTES = 4 * 2**20  # 100,000 control points of forty bytes; a project file has some thousands

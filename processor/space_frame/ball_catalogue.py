@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -10,11 +9,7 @@ from importlib import resources
 import numpy as np
 
 from processor.model import Checked, Floats, UsageError, column
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from processor.plain_text import tomllib
 
 DEFAULT = "plausible"
 ESTIMATED, DESIGNED = "estimated", "design"

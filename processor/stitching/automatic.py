@@ -26,6 +26,7 @@ from processor.stitching.fine import (
 )
 from processor.stitching.fine.bundle_adjustment import Solution
 from processor.stitching.fine.correspondences import Blocks, CellTable
+from processor.stitching.fine.pairs_and_loops import Pair
 from processor.stitching.params import Params
 from processor.stitching.planes import scan_planes
 from processor.stitching.planes.scan_planes import Cloud
@@ -84,13 +85,6 @@ def stitch(
         added, _ = direction_errors.added_covariance(blocks, solution, reference)
     solution = replace(solution, covariance=solution.covariance + added)
     scores = network.scores(patches, solution.T, placed.still is not None)
-    stated = []
-    for pair in pairs:
-        adjusted, found, b = scores[pair.a, pair.b], candidates[pair.a, pair.b], patches[pair.b]
-        elsewhere = not found or not pairwise.same(found[0].T_a_b, adjusted.T_a_b, b.side_mm, b)
-        why = (reason("stitch.pair-elsewhere"),) if elsewhere else ()
-        why = (reason("stitch.pair-contradicts"),) if pair.is_gross else why
-        stated.append(replace(pair, overlap=adjusted.overlap, used=not pair.is_gross, reasons=why))
     noise, class_mm = float(np.median([cloud.sigma_mm for cloud in clouds])), scanner_class_errors.known().view_mm
     # Where the prior determines a scan's range error better than the faces.
     unseen = tuple(scans[s].name for s in np.flatnonzero(solution.ranges_sd > np.sqrt(0.5) * class_mm).tolist())
@@ -99,7 +93,7 @@ def stitch(
         covariance=solution.covariance,
         origins=np.stack([cloud.origin for cloud in clouds]),
         coarse=coarse,
-        pairs=stated,
+        pairs=[_stated(pair, candidates[pair.a, pair.b], scores[pair.a, pair.b], patches[pair.b]) for pair in pairs],
         estimated=(noise, solution.tau[0], solution.tau[1]),
         point_mm=noise,
         reasons=(reason("stitch.ranges-by-class", scans=unseen, sd_mm=class_mm),) if unseen else (),
@@ -111,6 +105,17 @@ def stitch(
         ),
         links=sorted({*network.links(scores), *itertools.combinations(sorted(known), 2)}),
     )
+
+
+def _stated(pair: Pair, candidates: list[ScoredPose], adjusted: ScoredPose, b: ScanPatches) -> Pair:
+    """Return a pair with its overlap at the adjusted pose, and why it is not used, or what its best candidate says."""
+    if pair.is_gross:
+        why = (reason("stitch.pair-contradicts"),)
+    elif not candidates or not pairwise.same(candidates[0].T_a_b, adjusted.T_a_b, b.side_mm, b):
+        why = (reason("stitch.pair-elsewhere"),)
+    else:
+        why = ()
+    return replace(pair, overlap=adjusted.overlap, used=not pair.is_gross, reasons=why)
 
 
 def _place(patches: list[ScanPatches], params: Params, reference: int, given: Given) -> network.Network:

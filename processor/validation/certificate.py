@@ -13,13 +13,13 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
 from processor.language.messages import text
 from processor.model import Statistic
+from processor.plain_text import tomllib
 from processor.report import templates
 from processor.robust_statistics import finite_median
 from processor.store.json_values import json_ready
@@ -28,11 +28,6 @@ from processor.validation.coverage import Coverage
 from processor.validation.history import Figures, Row, by_quantity, of_items
 from processor.validation.matrix import Matrix
 from processor.validation.software_identity import Software
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 FORMAT, FORMAT_VERSION = "processor-certificate", "1.0"
 COVERAGE_FACTOR = 2.0  # for 95 % (GUM, G.6.6)

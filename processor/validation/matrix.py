@@ -35,7 +35,6 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import itertools
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,14 +43,10 @@ from typing import Any
 from processor.jobs.process import PROJECT
 from processor.model import InputError, UsageError, inputs
 from processor.model.inputs import Kind, Place, entry, hidden, listed, number, tables, text
+from processor.plain_text import tomllib
 from processor.validation.cells import Case, Cell, Origin, fresh_seed
 from processor.validation.coverage import Limits
 from processor.writers.toml import as_toml
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 DEFAULT, SMALLEST = (Path(__file__).with_name(f"{name}_matrix.toml") for name in ("default", "smallest"))
 FOREIGN = PROJECT / "tests" / "bench" / "foreign"  # part of the sources, not of an installed package

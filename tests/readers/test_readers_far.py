@@ -201,7 +201,7 @@ def test_the_unit_of_a_system_as_text(wkt, expected):
 @pytest.mark.parametrize(("code", "unit"), {2222: "ft", 2225: "us-ft", 2263: "us-ft", 3759: "us-ft", 2056: "m",
                          32633: "m", 2066: "", 4326: "", 12000: "", 32767: "", -1: ""}.items())  # fmt: skip
 def test_units_of_codes(code, unit):
-    assert epsg_units.horizontal(code) == unit
+    assert epsg_units.unit("horizontal", code) == unit
 
 
 @pytest.mark.parametrize("point_format", [3, 6])
