@@ -85,6 +85,8 @@ def stitch(
         added, _ = direction_errors.added_covariance(blocks, solution, reference)
     solution = replace(solution, covariance=solution.covariance + added)
     scores = network.scores(patches, solution.T, placed.still is not None)
+    refuted = network.refuted(scores, len(scans), reference)
+    refuted[list(known) if reference in known else []] = 0.0
     noise, class_mm = float(np.median([cloud.sigma_mm for cloud in clouds])), scanner_class_errors.known().view_mm
     # Where the prior determines a scan's range error better than the faces.
     unseen = tuple(scans[s].name for s in np.flatnonzero(solution.ranges_sd > np.sqrt(0.5) * class_mm).tolist())
@@ -98,11 +100,7 @@ def stitch(
         point_mm=noise,
         reasons=(reason("stitch.ranges-by-class", scans=unseen, sd_mm=class_mm),) if unseen else (),
         contradictions=contradictions.of_scans(cells, solution, GATES[0] * cells.size_mm),
-        refuted=np.where(
-            [s in known and reference in known for s in range(len(scans))],
-            0.0,
-            network.refuted(scores, len(scans), reference),
-        ),
+        refuted=refuted,
         links=sorted({*network.links(scores), *itertools.combinations(sorted(known), 2)}),
     )
 
