@@ -1,6 +1,6 @@
 """Distinct rows: cells that points lie in, pairs of numbers, points; in a fraction of the time of np.unique.
 
-And the connected components of what is linked.
+And the rows of each label, and the connected components of what is linked.
 """
 
 from __future__ import annotations
@@ -63,6 +63,12 @@ def distinct_points(points: Floats) -> tuple[Floats, Ints]:
     number = np.empty(len(points), np.int64)
     number[order] = np.cumsum(begins) - 1
     return ordered[begins], number
+
+
+def rows_by_label(label: Ints) -> list[Ints]:
+    """Return the rows (m,) of each label of labels (n,), the least label first."""
+    order = np.argsort(label, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if len(order) else []
 
 
 def components(count: int, a: Ints, b: Ints) -> Ints:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor.distinct_rows import components
+from processor.distinct_rows import components, rows_by_label
 from processor.model import Floats, Ints
 from processor.scan_folder.shapes.body import Body, Mask
 
@@ -48,11 +48,8 @@ def find(body: Body) -> Balls:
     """Find the balls of a mesh, each once: of concentric spheres the outer one."""
     ends, edges, centres, radii = _spheres_of_edges(body)
     used = list[Ints]()
-    label = _alike(edges, centres, radii)
     found = []
-    order = np.argsort(label, kind="stable")
-    groups = np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if len(order) else []
-    for rows in groups:
+    for rows in rows_by_label(_alike(edges, centres, radii)):
         if len(rows) >= FEWEST_EDGES and len(rows) > NET * len(np.unique(ends[rows])):
             ball = _fitted(
                 body, np.unique(edges[rows]), np.median(centres[rows], axis=0), float(np.median(radii[rows]))
@@ -111,18 +108,9 @@ def _of_rounded(body: Body, used: Ints) -> list[list[float]]:
 
     Where coordinates are rounded by more than a facet bulges, single edges are too uncertain: the whole face is used.
     """
-    label = body.faces_between
-    count = int(label.max()) + 1
-    weights = np.bincount(label, weights=body.areas, minlength=count)
-    mean = np.stack([np.bincount(label, weights=body.areas * n, minlength=count) for n in body.normals.T], axis=1)
-    off = body.normals - (mean / weights[:, None])[label]
-    spread = np.zeros((count, 3, 3))
-    for i in range(3):
-        for k in range(3):
-            sums = np.bincount(label, weights=body.areas * off[:, i] * off[:, k], minlength=count)
-            spread[:, i, k] = sums / weights
-    round_ = np.linalg.eigvalsh(spread)[:, 0] > TURNING
-    round_ &= np.bincount(label, minlength=count) >= FEWEST_FACETS
+    label, (count, mean, square) = body.faces_between, body.normals_of_faces
+    round_ = np.linalg.eigvalsh(square - mean[:, :, None] * mean[:, None])[:, 0] > TURNING
+    round_ &= count >= FEWEST_FACETS
     round_[label[used]] = False
     found = []
     for face in np.flatnonzero(round_).tolist():

@@ -109,6 +109,16 @@ class Body:
         sides = self.edges[1][~self.turning]
         return components(len(self.faces), *sides.T)
 
+    @cached_property
+    def normals_of_faces(self) -> tuple[Ints, Floats, Floats]:
+        """Of each face the number (c,) of facets, and the means by area of normals n (c, 3) and of n n^T (c, 3, 3)."""
+        label = self.faces_between
+        squares = self.normals[:, :, None] * self.normals[:, None]
+        weighted = self.areas[:, None] * np.column_stack([np.ones(len(label)), self.normals, squares.reshape(-1, 9)])
+        sums = np.stack([np.bincount(label, one) for one in weighted.T], axis=1)
+        means = sums[:, 1:] / sums[:, :1]
+        return np.bincount(label), means[:, :3], means[:, 3:].reshape(-1, 3, 3)
+
 
 def welded(name: str, vertices: Floats, faces: Ints) -> Body | None:
     """Return a body without repeated vertices and without facets of no area; None if nothing is left."""

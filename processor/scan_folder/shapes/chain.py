@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from processor.model import Floats, Reason, reason
+from processor.scan_folder.shapes import connected
 from processor.scan_folder.shapes.body import Body
 from processor.scan_folder.shapes.connected import Assembly, listed, unclosed
 from processor.scan_folder.shapes.contact_faces import GAP_MM, Contact
@@ -17,16 +18,12 @@ RISE_SHARE = 0.01  # of the span: less is no arch
 
 
 def find(bodies: Sequence[Body], contacts: Mapping[tuple[int, int], Contact]) -> Assembly | Reason:
-    """Return the longest chain of bodies that meet end to end, no body more than two others; or why there is none."""
-    beside: dict[int, list[int]] = {i: [] for i in range(len(bodies))}
-    for i, k in contacts:
-        beside[i].append(k)
-        beside[k].append(i)
-    chains = _paths(beside)
+    """Return the chain of bodies that meet end to end, no ring, no body more than two others; or why there is none."""
+    beside = connected.neighbours(contacts)
+    chains = [connected.walk({i: beside[i] for i in group})[0] for group in connected.groups(beside)]
     if not chains:
         everything = listed(bodies, range(len(bodies)))
         return reason("init.none-meet", parts=everything, gap_mm=GAP_MM, unclosed=unclosed(bodies))
-    chains.sort(key=lambda chain: -len(chain))
     if len(chains) > 1:
         first, second = (listed(bodies, chain) for chain in chains[:2])
         return reason("init.several-chains", first=first, second=second, unclosed=unclosed(bodies))
@@ -35,44 +32,18 @@ def find(bodies: Sequence[Body], contacts: Mapping[tuple[int, int], Contact]) ->
         len(order) == 2 and bodies[order[0]].centre[0] > bodies[order[1]].centre[0]
     ):
         order = order[::-1]
-    return _chain(bodies, order, contacts)
-
-
-def _chain(bodies: Sequence[Body], order: Sequence[int], contacts: Mapping[tuple[int, int], Contact]) -> Assembly:
-    doubts = []
     left_out = [i for i in range(len(bodies)) if i not in order]
-    if left_out:
-        doubts.append(reason("init.parts-left-out", parts=listed(bodies, left_out), unclosed=unclosed(bodies)))
-    joints = []
-    for i, k in pairwise(order):
-        one = contacts[min(i, k), max(i, k)]
-        joints.append(one if i < k else one.reverse)
-    links = tuple(pairwise(range(len(order))))
-    parts, others = (tuple(bodies[i] for i in which) for which in (order, left_out))
-    return Assembly(parts, links, tuple(joints), tuple(doubts), row=True, left_out=others)
+    doubt = reason("init.parts-left-out", parts=listed(bodies, left_out), unclosed=unclosed(bodies))
+    return connected.assembled(bodies, contacts, order, list(pairwise(order)), doubt, row=True)
 
 
 def _joint_x(contacts: Mapping[tuple[int, int], Contact], i: int, k: int) -> float:
     return float(contacts[min(i, k), max(i, k)].a.origin[0])
 
 
-def _paths(beside: Mapping[int, Sequence[int]]) -> list[list[int]]:
-    """Return the paths of two nodes or more of a graph whose nodes have two neighbours at most; circles are none."""
-    paths, seen = [], set[int]()
-    for start in sorted(beside):
-        if len(beside[start]) != 1 or start in seen:
-            continue
-        path = [start]
-        while len(path) == 1 or len(beside[path[-1]]) == 2:
-            path.append(next(k for k in beside[path[-1]] if k not in path))
-        seen.update(path)
-        paths.append(path)
-    return paths
-
-
 def frame_problem(chain: Assembly) -> Reason | None:
     """Return why a chain is not in the bridge's frame (X along the span, Z up); None if it is."""
-    points = np.vstack([chain.parts[0].centre, chain.middles, chain.parts[-1].centre])
+    points = chain.line
     span = points[-1] - points[0]
     off = float(np.arctan2(abs(span[1]), abs(span[0])))
     rise = _rise(points)
@@ -96,8 +67,7 @@ def frame_problem(chain: Assembly) -> Reason | None:
 
 def rises(chain: Assembly) -> bool:
     """Whether the parts make up an arch, which shows where up is."""
-    points = np.vstack([chain.parts[0].centre, chain.middles, chain.parts[-1].centre])
-    return bool(_rise(points)[2] > RISE_SHARE * np.linalg.norm(points[-1] - points[0]))
+    return bool(_rise(chain.line)[2] > RISE_SHARE * np.linalg.norm(chain.line[-1] - chain.line[0]))
 
 
 def _rise(points: Floats) -> Floats:

@@ -8,6 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
+from processor.distinct_rows import components, rows_by_label
 from processor.model import Floats, Reason, reason
 from processor.scan_folder.shapes.body import Body
 from processor.scan_folder.shapes.contact_faces import Contact, same_place
@@ -32,10 +33,9 @@ class Assembly:
     left_out: tuple[Body, ...] = ()
 
     @property
-    def middles(self) -> Floats:
-        """Middle (m, 3) of each joint, mm."""
-        middles: Floats = np.array([one.middle for one in self.contacts])
-        return middles
+    def line(self) -> Floats:
+        """Centre of the first part, middles of the joints, and centre of the last part (m + 2, 3), mm."""
+        return np.vstack([self.parts[0].centre, *(one.middle for one in self.contacts), self.parts[-1].centre])
 
 
 def listed(bodies: Sequence[Body], which: Sequence[int]) -> tuple[str, ...] | Reason:
@@ -79,9 +79,9 @@ def fasteners(bodies: Sequence[Body], contacts: Mapping[tuple[int, int], Contact
 
 def branched(contacts: Mapping[tuple[int, int], Contact]) -> bool:
     """Whether bodies that meet make up a ring, or one of them meets more than two others."""
-    beside = _beside(contacts)
+    beside = neighbours(contacts)
     return any(len(others) > 2 for others in beside.values()) or any(
-        sum(len(beside[i]) for i in group) >= 2 * len(group) for group in _groups(beside)
+        sum(len(beside[i]) for i in group) >= 2 * len(group) for group in groups(beside)
     )
 
 
@@ -91,31 +91,44 @@ def find(bodies: Sequence[Body], contacts: Mapping[tuple[int, int], Contact]) ->
     Parts are in the order in which their joints lead from one to the next, left is the one that comes first; the joint
     that closes a ring leads from its last part to the first.
     """
-    beside = _beside(contacts)
+    beside = neighbours(contacts)
     for i, others in beside.items():
         for k, m in combinations(others, 2):
             faces = [contacts[i, n].a if i < n else contacts[n, i].b for n in (k, m)]
             if same_place(*faces):
                 return reason("init.crowded", first=bodies[k].name, second=bodies[m].name, part=bodies[i].name)
-    groups = _groups(beside)
-    if len(groups) > 1:
-        first, second = (listed(bodies, group) for group in groups[:2])
+    apart = groups(beside)
+    if len(apart) > 1:
+        first, second = (listed(bodies, group) for group in apart[:2])
         return reason("init.several-groups", first=first, second=second, unclosed=unclosed(bodies))
     left_out = [i for i in range(len(bodies)) if i not in beside]
-    doubts = [reason("init.meets-no-part", parts=listed(bodies, left_out))] if left_out else []
-    order, steps = _walk(beside)
-    links = [(order.index(i), order.index(k)) for i, k in steps]
-    joints = [contacts[i, k] if i < k else contacts[k, i].reverse for i, k in steps]
-    return Assembly(
-        tuple(bodies[i] for i in order),
-        tuple(links),
-        tuple(joints),
-        tuple(doubts),
-        left_out=tuple(bodies[i] for i in left_out),
+    return assembled(
+        bodies, contacts, *walk(beside), reason("init.meets-no-part", parts=listed(bodies, left_out)), row=False
     )
 
 
-def _beside(contacts: Mapping[tuple[int, int], Contact]) -> dict[int, list[int]]:
+def assembled(
+    bodies: Sequence[Body],
+    contacts: Mapping[tuple[int, int], Contact],
+    order: Sequence[int],
+    steps: Sequence[tuple[int, int]],
+    doubt: Reason,
+    row: bool,
+) -> Assembly:
+    """Return bodies in an order, joined step by step; there is the ``doubt`` where some are left out."""
+    left_out = tuple(body for i, body in enumerate(bodies) if i not in order)
+    return Assembly(
+        tuple(bodies[i] for i in order),
+        tuple((order.index(i), order.index(k)) for i, k in steps),
+        tuple(contacts[i, k] if i < k else contacts[k, i].reverse for i, k in steps),
+        (doubt,) if left_out else (),
+        row=row,
+        left_out=left_out,
+    )
+
+
+def neighbours(contacts: Mapping[tuple[int, int], Contact]) -> dict[int, list[int]]:
+    """Return which bodies each of those that meet any meets."""
     beside: dict[int, list[int]] = {}
     for i, k in contacts:
         beside.setdefault(i, []).append(k)
@@ -123,23 +136,17 @@ def _beside(contacts: Mapping[tuple[int, int], Contact]) -> dict[int, list[int]]
     return {i: sorted(beside[i]) for i in sorted(beside)}
 
 
-def _groups(beside: Mapping[int, Sequence[int]]) -> list[list[int]]:
+def groups(beside: Mapping[int, Sequence[int]]) -> list[list[int]]:
     """Return the nodes of each connected piece of a graph, the largest first."""
-    groups, seen = [], set[int]()
-    for start in beside:
-        if start in seen:
-            continue
-        group, left = {start}, [start]
-        while left:
-            others = set(beside[left.pop()]) - group
-            group |= others
-            left += others
-        seen |= group
-        groups.append(sorted(group))
-    return sorted(groups, key=lambda group: -len(group))
+    if not beside:
+        return []
+    links = np.array([(i, k) for i, others in beside.items() for k in others], np.int64).reshape(-1, 2)
+    label = components(max(beside) + 1, *links.T)
+    found = [[i for i in rows.tolist() if i in beside] for rows in rows_by_label(label)]
+    return sorted(filter(None, found), key=lambda group: -len(group))
 
 
-def _walk(beside: Mapping[int, Sequence[int]]) -> tuple[list[int], list[tuple[int, int]]]:
+def walk(beside: Mapping[int, Sequence[int]]) -> tuple[list[int], list[tuple[int, int]]]:
     """Return the nodes of a connected graph from a node of few neighbours on, depth first, and each edge once."""
     start = min(beside, key=lambda i: (len(beside[i]), i))
     order, steps, left = list[int](), list[tuple[int, int]](), [(start, start)]

@@ -71,37 +71,37 @@ def guess(
     """
     chosen, doubts = surface_files.one_a_stem(group)
     surfaces = [surface_files.read(folder, path, given_unit or "mm") for path in chosen]
-    names = _names(folder, chosen)
+    names = tuple(str(path.relative_to(folder)) for path in chosen)
     # Scans are of a whole frame, but of single parts of a bridge.
-    units = _unit(surfaces, scans, given_unit, as_whole=True)
-    before = units.unit or "mm"
+    unit, unit_doubts = guess_unit.guess(surfaces, scans, given_unit, as_whole=True)
+    before = unit or "mm"
     surfaces = _in_unit(folder, surfaces, given_unit or "mm", before)
-    bodies = _bodies(folder, surfaces, units.unit or "mm").bodies
+    bodies = _bodies(folder, surfaces, before).bodies
     if not bodies:
         return GuessedDesign(other_doubts=(*doubts, reason("init.no-area")), files=names)
     frame = space_frame.find(stacked("all", bodies))
     if frame is not None:
         return GuessedDesign(
-            design=frame[0] if units.unit else None,
+            design=frame[0] if unit else None,
             other_doubts=(*doubts, *frame[1]),
-            unit_doubts=units.doubts,
-            units=_json_unit(surfaces, units),
+            unit_doubts=unit_doubts,
+            units=_json_unit(surfaces, before),
             reasons=(reason("init.shown-by-balls", files=_some(names)),),
             files=names,
             unsure=frame[2],
         )
-    units = _unit(surfaces, scans, given_unit, as_whole=len(surfaces) == 1)
-    if not units.unit:
-        return GuessedDesign(other_doubts=tuple(doubts), unit_doubts=units.doubts, files=names)
-    surfaces = _in_unit(folder, surfaces, before, units.unit)
-    parts = _bodies(folder, surfaces, units.unit)
+    unit, unit_doubts = guess_unit.guess(surfaces, scans, given_unit, as_whole=len(surfaces) == 1)
+    if not unit:
+        return GuessedDesign(other_doubts=tuple(doubts), unit_doubts=unit_doubts, files=names)
+    surfaces = _in_unit(folder, surfaces, before, unit)
+    parts = _bodies(folder, surfaces, unit)
     # Two scans or more have the names of one body each, and none that of several
     of_bodies = [body.name for body in parts.bodies]
     of_scan = [component_names.components(stem, of_bodies) for stem in stems]
     single = [found[0] for found in of_scan if len(found) == 1]
     scanned = len(set(single)) > 1 and len(single) == len(stems)
-    guessed = _bridge(parts, names, tuple(doubts), _json_unit(surfaces, units), scanned)
-    return replace(guessed, unit_doubts=units.doubts)
+    guessed = _bridge(parts, names, tuple(doubts), _json_unit(surfaces, unit), scanned)
+    return replace(guessed, unit_doubts=unit_doubts)
 
 
 def _in_unit(
@@ -116,19 +116,9 @@ def _in_unit(
     ]
 
 
-def _unit(
-    surfaces: Sequence[surface_files.Surface], scans: Sequence[tuple[float, str]], given: str, as_whole: bool
-) -> guess_unit.DesignUnit:
-    if given:
-        return guess_unit.DesignUnit(given)
-    if all(surface.unit for surface in surfaces):
-        return guess_unit.DesignUnit("mm")
-    return guess_unit.guess([surface.vertices for surface in surfaces], scans, as_whole)
-
-
-def _json_unit(surfaces: Sequence[surface_files.Surface], units: guess_unit.DesignUnit) -> str:
+def _json_unit(surfaces: Sequence[surface_files.Surface], unit: str) -> str:
     """Return the unit of design.json, which is also that of the meshes it names."""
-    return "mm" if all(surface.unit for surface in surfaces) else units.unit or "mm"
+    return "mm" if all(surface.unit for surface in surfaces) else unit
 
 
 def _bridge(
@@ -166,10 +156,6 @@ def _kind_doubts(found: arch_bridge.GuessedArch, named: bool) -> tuple[Reason, .
 
 def _some(names: Sequence[str]) -> tuple[str, ...] | Reason:
     return tuple(names) if len(names) <= 3 else reason("init.and-more", names=tuple(names[:3]))
-
-
-def _names(folder: Path, paths: Sequence[Path]) -> tuple[str, ...]:
-    return tuple(str(path.relative_to(folder)) for path in paths)
 
 
 def _bodies(folder: Path, surfaces: Sequence[surface_files.Surface], units: str) -> _Parts:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processor.distinct_rows import components
+from processor.distinct_rows import components, rows_by_label
 from processor.geometry import circle
 from processor.model import Floats, Ints
 from processor.scan_folder.shapes.body import Body
@@ -40,11 +40,8 @@ def find(body: Body) -> Tubes:
     turning = two[(cosine[two] <= FLAT_COS) & (cosine[two] > TURN_COS)]
     ways = body.vertices[ends[turning, 1]] - body.vertices[ends[turning, 0]]
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-    label = _parallel(pieces[sides[turning]], ways)
-    order = np.argsort(label, kind="stable")
-    groups = np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if len(order) else []
     axes, used = [], [np.empty(0, np.int64)]
-    for rows in groups:
+    for rows in rows_by_label(_parallel(pieces[sides[turning]], ways)):
         one = _fitted(body.vertices[ends[turning[rows]]], ways[rows]) if len(rows) >= FEWEST_EDGES else None
         if one is not None:
             axes.append(one)
@@ -58,15 +55,9 @@ def _of_rounded(body: Body, used: Ints) -> list[tuple[Floats, float]]:
 
     Where coordinates are rounded by more than a facet bulges, single edges are too uncertain: the whole face is used.
     """
-    label = body.faces_between
-    count = int(label.max()) + 1
-    moments = np.zeros((count, 3, 3))
-    for i in range(3):
-        for k in range(3):
-            weights = body.areas * body.normals[:, i] * body.normals[:, k]
-            moments[:, i, k] = np.bincount(label, weights=weights, minlength=count)
-    values, vectors = np.linalg.eigh(moments / np.bincount(label, weights=body.areas, minlength=count)[:, None, None])
-    turns = (values[:, 0] < ACROSS) & (values[:, 1] > ABOUT) & (np.bincount(label, minlength=count) >= FEWEST_FACETS)
+    label, (count, _, square) = body.faces_between, body.normals_of_faces
+    values, vectors = np.linalg.eigh(square)
+    turns = (values[:, 0] < ACROSS) & (values[:, 1] > ABOUT) & (count >= FEWEST_FACETS)
     turns[label[used]] = False
     found = []
     for face in np.flatnonzero(turns).tolist():
