@@ -18,7 +18,7 @@ from typing import Any
 
 from processor.batch import job as batch_job
 from processor.batch import summary
-from processor.batch.find_inputs import STATE, Input, Inputs, find
+from processor.batch.find_inputs import STATE, Inputs, find
 from processor.batch.job import Job, OutputGoneError
 from processor.batch.record import JobStatus, Record
 from processor.jobs import process, runner
@@ -31,7 +31,7 @@ from processor.scan_folder.files import missing
 from processor.store.making import remove_leftovers
 from processor.store.whole_output import check_folder, replace_text
 
-LOGS = "logs"
+LOGS, TOKEN = "logs", "token"
 LONGEST_NAME = 240  # bytes of a file's name, with room for prefix and suffix
 MEMORY_SHARE, LEAST_MEMORY_MB = 0.8, 1024  # of the machine, for all jobs together; for a job
 
@@ -101,7 +101,7 @@ def run(settings: Settings, say: Callable[[str], None], ended: Callable[[Record]
                 records = _records(results, len(jobs), say, ended)
         finally:
             with suppress(OSError):
-                _token_file(state).unlink()  # jobs that still run on a worker out of reach end themselves
+                (state / TOKEN).unlink()  # jobs that still run on a worker out of reach end themselves
             shutil.rmtree(state / "work", ignore_errors=True)
         return summary.write(out, [(job, records[job.name]) for job in jobs], inputs.left_out, settings.lang)
 
@@ -140,17 +140,13 @@ def _checked(job: Job, result: Record | Lost) -> Record:
     return Record(input=job.name, identity="", status=JobStatus.FAILED, reason=why)
 
 
-def _token_file(state: Path) -> Path:
-    return state / "token"
-
-
 def _jobs(settings: Settings, inputs: Inputs, root: Path, out: Path, state: Path) -> list[Job]:
     """Make the list of jobs, and prepare the folder for them."""
     shutil.rmtree(state / "work", ignore_errors=True)
     for folder in ("failed", "work"):
         (state / folder).mkdir(exist_ok=True)
     token = secrets.token_hex(8)
-    replace_text(_token_file(state), token)
+    replace_text(state / TOKEN, token)
     summary.remove(out)  # there is none until all jobs are done: an older one would be of other results
     run_options = (*settings.run_options, "--methods-from", str(Path.cwd()))
     if settings.params_toml:
@@ -165,6 +161,7 @@ def _jobs(settings: Settings, inputs: Inputs, root: Path, out: Path, state: Path
     jobs = []
     for each in inputs.inputs:
         key = keys[each.name]
+        log = out / LOGS / f"{each.path.name if each.name == '.' else each.name}.log"
         units = ("--units", settings.units) if settings.units and not each.is_scene else ()
         # Of the machine's share each job at once has its part
         total_mb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2**20
@@ -175,10 +172,10 @@ def _jobs(settings: Settings, inputs: Inputs, root: Path, out: Path, state: Path
                 root=root,
                 out=out,
                 results_folder=out / (root.name if each.name == "." else each.name),
-                log=_log(out, each, key),
+                log=log if len(os.fsencode(log.name)) <= LONGEST_NAME else log.with_name(f"{key}.log"),
                 failure_record=state / "failed" / f"{key}.json",
                 work_folder=state / "work" / key,
-                token_file=_token_file(state),
+                token_file=state / TOKEN,
                 batch_token=token,
                 run_options=(*run_options, *units),
                 identity_parameters={**settings.identity_parameters, "units": settings.units if units else None},
@@ -191,11 +188,6 @@ def _jobs(settings: Settings, inputs: Inputs, root: Path, out: Path, state: Path
             )
         )
     return jobs
-
-
-def _log(out: Path, each: Input, key: str) -> Path:
-    path = out / LOGS / f"{each.path.name if each.name == '.' else each.name}.log"
-    return path if len(os.fsencode(path.name)) <= LONGEST_NAME else path.with_name(f"{key}.log")
 
 
 @contextmanager

@@ -8,36 +8,19 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import typing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from processor.model import (
-    ArchTruth,
-    AsBuilt,
-    BodyTruth,
-    DefectTruth,
-    FrameTruth,
-    InputError,
-    PoseTruth,
-    RecordError,
-    StationTruth,
-    StructureTruth,
-    TargetTruth,
-    Truth,
-)
+from processor.model import BodyTruth, InputError, RecordError, Truth
 
 NAME, FORMAT = "truth.json", "processor-truth"
 RECORDS: dict[str, type[Any]] = {
-    "arch": ArchTruth,
-    "frame": FrameTruth,
-    "structure": StructureTruth,
-    "defects": DefectTruth,
-    "stations": StationTruth,
-    "as_built": AsBuilt,
-    "pose": PoseTruth,
-    "targets": TargetTruth,
+    name: typing.get_args(hint)[0]
+    for name, hint in typing.get_type_hints(Truth).items()
+    if type(None) in typing.get_args(hint)
 }
 NUMBERS = ("spacing_mm", "sigma_mm")
 KNOWN = {"format", "about", *NUMBERS, *RECORDS}

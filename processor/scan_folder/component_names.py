@@ -61,24 +61,14 @@ def components(stem: str, names: Sequence[str]) -> list[str]:
         term = plain(name)
         digits = re.search(r"\d+$", term)
         word = term[: digits.start() if digits else None].strip(" _-.")
-        if not word or not _has_word(text, word):
+        latin = re.fullmatch(r"[a-z ]+", word)  # such a word must not be part of a longer one
+        if not word or not (re.search(rf"(?<![a-z]){word}(?![a-z])", text) if latin else word in text):
             continue
-        by_number += [name] if digits is None or _has_number(text, word, digits[0].lstrip("0")) else []
         by_word.append(name)
+        number, literal = digits[0].lstrip("0") if digits else "", re.escape(word)
+        beside = rf"{literal}{NUMBERED}0*{number}(?!\d)|(?<!\d)0*{number}{NUMBERED}{literal}"
+        by_number += [name] if not digits or re.search(beside, text) else []
     return by_number or by_word
-
-
-def _has_word(text: str, word: str) -> bool:
-    """Whether a word is in a text; a word of Latin letters must not be part of a longer one."""
-    latin = re.fullmatch(r"[a-z ]+", word) is not None
-    return bool(re.search(rf"(?<![a-z]){word}(?![a-z])", text)) if latin else word in text
-
-
-def _has_number(text: str, word: str, number: str) -> bool:
-    """Whether a word is adjacent to a number in a text."""
-    after = rf"{re.escape(word)}{NUMBERED}0*{number}(?!\d)"
-    before = rf"(?<!\d)0*{number}{NUMBERED}{re.escape(word)}"
-    return bool(re.search(after, text) or re.search(before, text))
 
 
 def station(stem: str) -> str:

@@ -11,7 +11,7 @@ from processor.model import Control, InputError, Scan, Stations
 from processor.scan_folder.file_values import existing_file_in
 from processor.scan_folder.files import CONTROL
 from processor.scan_folder.project_file import ControlPoint
-from processor.scan_folder.text_files import csv_rows
+from processor.scan_folder.text_files import csv_table
 from processor.scan_folder.units import MM_PER_UNIT, FileUnit
 
 COLUMNS = ("name", "scan", "x", "y", "z", "sd_mm")
@@ -40,28 +40,20 @@ def _from_csv(path: Path) -> list[ControlPoint]:
         raise InputError(
             f"expected at most {LARGEST_FILE} bytes, found {path.stat().st_size}; is it the right file?", path=path
         )
-    rows = csv_rows(path)
-    header = tuple(name.strip().lower() for name in rows[0][1]) if rows else ()
-    if sorted(header) != sorted(COLUMNS):
-        raise InputError(f"expected columns {','.join(COLUMNS)}, found {','.join(header)[:80]!r}", path=path)
     measured = []
-    for line, row in rows[1:]:
-        where = f"{path}: line {line}"
-        cells = dict(zip(header, (cell.strip() for cell in row), strict=False))
-        if len(row) != len(header):
-            raise InputError(f"{where}: expected {len(header)} cells, found {len(row)}: {','.join(row)[:80]!r}")
+    for where, cells in csv_table(path, COLUMNS):
+        row, name, scan = list(cells.values()), cells["name"], cells["scan"]
         try:
             position = np.array([float(cells[axis]) for axis in "xyz"])
             sd_mm = float(cells["sd_mm"] or "0")
-        except (KeyError, ValueError):
+        except ValueError:
             raise InputError(f"{where}: expected {','.join(COLUMNS)}, found {row}") from None
-        if not cells["name"] or not np.isfinite(position).all():
+        if not name or not np.isfinite(position).all():
             raise InputError(f"{where}: expected a name and finite coordinates, found {row}")
-        if not cells["scan"] and not 0.0 < sd_mm < np.inf:
+        if not scan and not 0.0 < sd_mm < np.inf:
             raise InputError(f"{where}: expected sd_mm above 0 for known coordinates, found {sd_mm:g}")
         if not 0.0 <= sd_mm < np.inf:
             raise InputError(f"{where}: expected a standard deviation of 0 mm or more, found {sd_mm}")
-        name, scan = cells["name"], cells["scan"]
         measured.append(
             ControlPoint(name, scan=scan, seen=position, seen_sd_mm=sd_mm, where=where)
             if scan

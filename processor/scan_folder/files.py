@@ -20,12 +20,6 @@ CAD_SUFFIXES = (".step", ".stp", ".ifc")  # made into meshes first, see :mod:`pr
 NOT_SCANS = ("design.csv", PICKS, "deviation.csv", CONTROL, "index.csv")
 
 
-def only_cad_file(folder: Path) -> str:
-    """Return the name of the one CAD file of a folder, which no scan can be; "" where there is none or several."""
-    found = [path.name for path in sorted(folder.iterdir()) if path.suffix.lower() in CAD_SUFFIXES and path.is_file()]
-    return found[0] if len(found) == 1 else ""
-
-
 def node_list_in(folder: Path, excluded: Collection[Path | None]) -> str:
     """Return the name of the one list of a frame's nodes in a folder, by the headings of its columns; "" without one.
 
@@ -76,11 +70,6 @@ def belongs(place: Path) -> bool:
 
 def _scans_in(places: Collection[Path], excluded: Collection[Path | None]) -> list[Path]:
     paths = [path for place in places for path in sorted(place.iterdir())]
-    return [path for path in paths if not path.name.startswith(".") and _may_be_scan(path, excluded)]
-
-
-def _may_be_scan(path: Path, excluded: Collection[Path | None]) -> bool:
-    if readers.is_closed(path):
-        return True
-    named = path.suffix.lower() in readers.SUFFIXES and path.name not in NOT_SCANS
-    return named and path not in excluded and path.is_file()
+    known = [path for path in paths if path.suffix.lower() in readers.SUFFIXES and path.name not in NOT_SCANS]
+    scans = {path for path in known if path not in excluded and path.is_file()}
+    return [path for path in paths if path.name[0] != "." and (readers.is_closed(path) or path in scans)]

@@ -42,6 +42,7 @@ from processor.scan_folder.control_points import control_points, read_control
 from processor.scan_folder.design import is_surface, read_design, read_json, read_surface
 from processor.scan_folder.file_values import existing_file_in
 from processor.scan_folder.files import (
+    CAD_SUFFIXES,
     CONTROL,
     DESIGNS,
     PICKS,
@@ -51,10 +52,8 @@ from processor.scan_folder.files import (
     TRUTH,
     missing,
     node_list_in,
-    only_cad_file,
     scan_files,
 )
-from processor.scan_folder.guess import Guess
 from processor.scan_folder.picks import read_picks
 from processor.scan_folder.project_file import CeilingEntry, ListedStation, Project, ScanEntry, Station
 from processor.scan_folder.shapes import surface_files
@@ -133,13 +132,15 @@ def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
         else:
             design = read_design(folder, project.design, unit)
         record_checks.check(design, str(project.design))  # before scans are compared with it
-    design = _in_stated_frame(design, project)
+    if project.design_frame:
+        if not isinstance(design, FrameDesign):
+            raise InputError(f"{project.where}: 'design_frame' is for the nodes of a space frame; take it out")
+        design = dataclasses.replace(design, coordinates=project.design_frame)
     check_components(str(folder / PROJECT), project.tolerance, _component_names(design))
     unit = project.units or option or "m"
     scene = _scene(project, design, option, _read_stations(folder, unit), keep)
-    scene = dataclasses.replace(scene, units_reason=(*scene.units_reason, *remarks))
-    if project.ceiling is not None:
-        scene = dataclasses.replace(scene, ceiling=_ceiling(project.ceiling, unit, project.design_units or unit))
+    ceiling = None if project.ceiling is None else _ceiling(project.ceiling, unit, project.design_units or unit)
+    scene = dataclasses.replace(scene, units_reason=(*scene.units_reason, *remarks), ceiling=ceiling)
     if (folder / PICKS).exists():
         # Picks are in the unit of their scans; scans in different units need one by --units.
         unit_of_picks = scene.units if scene.units in MM_PER_UNIT else ""
@@ -163,15 +164,6 @@ def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
     )
     files |= dict.fromkeys(of_project, PROJECT)
     return record_checks.check(scene, str(folder), {field: str(folder / file) for field, file in files.items()})
-
-
-def _in_stated_frame(design: Design | None, project: Project) -> Design | None:
-    """Add what project.toml states of the frame that a design's coordinates are in."""
-    if not project.design_frame:
-        return design
-    if not isinstance(design, FrameDesign):
-        raise InputError(f"{project.where}: 'design_frame' is for the nodes of a space frame; take it out")
-    return dataclasses.replace(design, coordinates=project.design_frame)
 
 
 def _ceiling(given: CeilingEntry, unit: str, surface_unit: str) -> Ceiling:
@@ -245,8 +237,9 @@ def _read_project(folder: Path) -> Project:
     if path.exists():
         existing_file_in(folder, PROJECT, str(folder))
         content = read_toml(path)
-    else:
-        guessed = _guess(folder)
+    elif not any((folder / name).exists() for name in DESIGNS) and surface_files.candidates(folder):
+        found = guess.guess(folder)  # as `processor init` does; taken where the surfaces show a bridge or a frame
+        guessed = found if found.made and not found.made.kind_doubts else None
     project = read(Project, content, place)
     control, control_file = read_control(folder, project.control)
     name = project.name or file_name_as_text(folder.resolve().name)
@@ -262,24 +255,17 @@ def _read_project(folder: Path) -> Project:
         )
     design = project.design
     if design is None:
-        found = next((name for name in DESIGNS if (folder / name).exists()), "")
-        if not found and not path.exists():
-            found = only_cad_file(folder)
-        if not found and project.kind in ("", "space-frame"):
-            found = node_list_in(folder, (*(scan.file for scan in project.scan), control_file))
-        design = existing_file_in(folder, found, str(path)) if found else None
+        file = next((name for name in DESIGNS if (folder / name).exists()), "")
+        cad = [one.name for one in folder.iterdir() if one.suffix.lower() in CAD_SUFFIXES and one.is_file()]
+        if not file and not path.exists() and len(cad) == 1:
+            file = cad[0]  # no scan can be one
+        if not file and project.kind in ("", "space-frame"):
+            file = node_list_in(folder, (*(scan.file for scan in project.scan), control_file))
+        design = existing_file_in(folder, file, str(path)) if file else None
     scans = project.scan or tuple(
         ScanEntry(file) for file in _open_scans(folder, scan_files(folder, (design, control_file)))
     )
     return dataclasses.replace(project, design=design, scan=scans)
-
-
-def _guess(folder: Path) -> Guess | None:
-    """Return what `processor init` guesses of a folder whose surfaces show a bridge or a frame; else None."""
-    if any((folder / name).exists() for name in DESIGNS) or not surface_files.candidates(folder):
-        return None
-    guessed = guess.guess(folder)
-    return guessed if guessed.made and not guessed.made.kind_doubts else None
 
 
 def _open_scans(folder: Path, files: Sequence[Path]) -> list[Path]:
@@ -382,6 +368,10 @@ def _scene(
     where = stations or _stations(scans)
     of_project, why_units = project.units or option or "m", list(reasons.values())
     different = (one for i, one in enumerate(why_units) if one not in why_units[:i])  # reasons have no hash
+    guessed: tuple[Reason, ...] = ()  # that the design was found in the files
+    if project.guessed is not None:
+        unsure = bool(project.guessed.doubts)
+        guessed = (reason("units.design-guessed-unsure") if unsure else reason("units.design-guessed"),)
     search = TargetSearch(find.side_mm, find.sphere_radius_mm) if (find := project.targets) else None
     return Scene(
         project.name,
@@ -392,7 +382,7 @@ def _scene(
         stations=where,
         temperature_C=project.temperature_C,
         units=", ".join(reasons),
-        units_reason=(*different, *_of_guess(project), *summed(found.remarks), *found.faults()),
+        units_reason=(*different, *guessed, *summed(found.remarks), *found.faults()),
         structure=design if isinstance(design, StructureDesign) else None,
         tolerance=project.tolerance,
         control=control_points(project.measured, scans, found.units, where, of_project, search is not None),
@@ -418,13 +408,6 @@ def _instruments(of_all: Instrument | None, found: _Found) -> tuple[Instrument, 
         alike.setdefault(repr(one), (one, []))[1].append(scan)
     own = [dataclasses.replace(one, scans=tuple(scans)) for one, scans in alike.values()]
     return (*own, *([] if len(found.of_scans) == len(found.scans) else [of_all or instruments.of_class()]))
-
-
-def _of_guess(project: Project) -> Iterator[Reason]:
-    """Yield that the design was found in the files."""
-    if project.guessed is not None:
-        unsure = bool(project.guessed.doubts)
-        yield reason("units.design-guessed-unsure") if unsure else reason("units.design-guessed")
 
 
 def _read_raws(entry: ScanEntry, scans: Sequence[Scan]) -> Iterator[RawScan]:
@@ -488,9 +471,11 @@ def _scan(raw: RawScan, entry: ScanEntry, unit: FileUnit, parts: set[str], stati
     position = raw.position if entry.position is None else entry.position
     station = raw.station if stations is not None else raw.station[:0]
     if stations is not None and not position.size and not station.any():
-        position = _named_position(entry.station or raw.name, stations, pose)
-        position = position / scale[: position.size]
-        station = station[:0] if position.size else station
+        named = entry.station or raw.name
+        if named in stations.ids:
+            position = stations.positions[stations.ids.index(named)]
+            position = (rigid.apply(rigid.invert(pose), position) if pose.size else position) / scale
+            station = station[:0]
     if stations is not None and len(station):
         least, most = map(int, large_arrays.extremes(raw.station))
         if not 0 <= least <= most <= len(stations.ids):
@@ -520,14 +505,6 @@ def _scan(raw: RawScan, entry: ScanEntry, unit: FileUnit, parts: set[str], stati
         sigma_mm=entry.sigma_mm,
         colour=raw.colour,
     )
-
-
-def _named_position(name: str, stations: Stations, pose: Floats) -> Floats:
-    """Return the position (3,) in mm, in a scan's frame, of the station that has the scan's name; (0,) without one."""
-    if name not in stations.ids:
-        return np.empty(0)
-    position = stations.positions[stations.ids.index(name)]
-    return rigid.apply(rigid.invert(pose), position) if pose.size else position
 
 
 def _stations(scans: list[Scan]) -> Stations | None:

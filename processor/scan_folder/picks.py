@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from processor.model import InputError, Picks, Scan
-from processor.scan_folder.text_files import csv_rows
+from processor.scan_folder.text_files import csv_table
 from processor.scan_folder.units import MM_PER_UNIT
 
 COLUMNS = ("scan_a", "scan_b", "point", "xa", "ya", "za", "xb", "yb", "zb")
@@ -19,31 +19,24 @@ def read_picks(path: Path, scans: Sequence[Scan], unit: str) -> Picks:
 
     Raises InputError, which names the line, for malformed rows and for scans that do not exist.
     """
-    rows = csv_rows(path)
-    header = tuple(cell.strip().lower() for cell in rows[0][1]) if rows else ()
-    if header != COLUMNS:
-        raise InputError(f"expected columns {','.join(COLUMNS)}, found {','.join(header)[:80]!r}", path=path)
     known = {scan.name for scan in scans}
     names_a, names_b, point_names, numbers = [], [], [], []
-    for line, row in rows[1:]:
-        where = f"{path}: line {line}"
-        if len(row) != len(COLUMNS):
-            raise InputError(f"{where}: expected {len(COLUMNS)} cells, found {len(row)}")
-        a, b = row[0].strip(), row[1].strip()
+    for where, cells in csv_table(path, COLUMNS):
+        a, b, point, *row = (cells[name] for name in COLUMNS)
         for name in (a, b):
             if name not in known:
                 raise InputError(f"{where}: there is no scan {name!r}; there are {', '.join(sorted(known))}")
         if a == b:
             raise InputError(f"{where}: expected two scans, found {a!r} twice; name two scans")
         try:
-            values = [float(cell) for cell in row[3:]]
+            values = [float(cell) for cell in row]
         except ValueError:
-            raise InputError(f"{where}: expected six numbers, found {row[3:]}") from None
+            raise InputError(f"{where}: expected six numbers, found {row}") from None
         if not np.isfinite(values).all():
-            raise InputError(f"{where}: expected finite numbers, found {row[3:]}")
+            raise InputError(f"{where}: expected finite numbers, found {row}")
         names_a.append(a)
         names_b.append(b)
-        point_names.append(row[2].strip())
+        point_names.append(point)
         numbers.append(values)
     if not numbers:
         raise InputError("holds no points; expected three or more for each pair of scans", path=path)

@@ -31,9 +31,12 @@ def of_scanner(points: Floats, row: Labels, column: Labels, scanner: Floats) -> 
         if not _fits(row, column):
             return NO_GRID
     rows, columns = _lines(row), _lines(column)
-    if _is_swept(points, row, column, scanner) and not _has_duplicates(row, column, rows, columns):
-        return row, column
-    return NO_GRID
+    if not _is_swept(points, row, column, scanner):
+        return NO_GRID
+    seen = np.zeros((rows * columns >> 3) + 1, np.uint8)  # one bit a cell
+    if any(_seen_before(row[part], column[part], rows, seen) for part in large_arrays.blocks(len(row))):
+        return NO_GRID
+    return row, column
 
 
 def _fits(row: Labels, column: Labels) -> bool:
@@ -65,14 +68,9 @@ def _is_swept(points: Floats, row: Labels, column: Labels, scanner: Floats) -> b
     return bool(difference < RAY_TOLERANCE * np.linalg.norm(u - u.mean(axis=0), axis=1).mean())
 
 
-def _has_duplicates(row: Labels, column: Labels, rows: int, columns: int) -> bool:
-    """Whether two points are in one cell; one bit a cell."""
-    seen = np.zeros((rows * columns >> 3) + 1, np.uint8)
-    return any(_seen_before(row[part], column[part], rows, seen) for part in large_arrays.blocks(len(row)))
-
-
 @njit(cache=True, nogil=True)
 def _seen_before(row, column, rows, seen):  # type: ignore[no-untyped-def]
+    """Whether a point is in a cell that has one already, by its bit in ``seen``."""
     for i in range(len(row)):
         cell = np.int64(column[i]) * rows + row[i]
         bit = np.uint8(1 << (cell & 7))

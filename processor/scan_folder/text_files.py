@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,24 @@ def read_text(path: Path, most: int = TEXT_BYTES) -> str:
         return decoded(path.read_bytes())
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", path=path) from None
+
+
+def csv_table(path: Path, columns: Sequence[str]) -> list[tuple[str, dict[str, str]]]:
+    """Return the place of each row of a CSV file, for messages, and its cells by these columns, in any order.
+
+    Raises InputError for other columns, and for a row of more or fewer cells.
+    """
+    rows = csv_rows(path)
+    header = [name.strip().lower() for name in rows[0][1]] if rows else []
+    if sorted(header) != sorted(columns):
+        raise InputError(f"expected columns {','.join(columns)}, found {','.join(header)[:80]!r}", path=path)
+    table = []
+    for line, row in rows[1:]:
+        where = f"{path}: line {line}"
+        if len(row) != len(header):
+            raise InputError(f"{where}: expected {len(header)} cells, found {len(row)}: {','.join(row)[:80]!r}")
+        table.append((where, dict(zip(header, map(str.strip, row), strict=True))))
+    return table
 
 
 def csv_rows(path: Path, separator: str = ",") -> list[tuple[int, list[str]]]:

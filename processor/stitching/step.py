@@ -84,7 +84,8 @@ def _by_picks(scans: Sequence[Scan], picked: Picked, reference: int, params: Par
         except three_point.TooFewError as error:
             shortages[a, b] = error.shortage
     pooled = three_point.pooled(list(fits.values())) if fits else []
-    pairs = [three_point.as_pair(a, b, fit, _of_pair(fit, params)) for (a, b), fit in zip(fits, pooled, strict=True)]
+    limit = params.scale_limit_ppm
+    pairs = [three_point.as_pair(a, b, fit, limit) for (a, b), fit in zip(fits, pooled, strict=True)]
     _say_pairs(names, pooled, pairs, picked)
     unused = [
         reason("stitch.pair-not-used", a=names[a], b=names[b], shortage=shortage)
@@ -125,14 +126,6 @@ def _say_pairs(names: Sequence[str], fits: Sequence[PairFit], pairs: Sequence[Pa
             for name, points in zip(of_pair, picked[pair.a, pair.b], strict=True):
                 with diagnostics.placed(np.eye(4), f"scan {name}"):
                     diagnostics.keep(f"picks in {name}", points)
-
-
-def _of_pair(fit: PairFit, params: Params) -> tuple[Reason, ...]:
-    """Return the likely cause of the pair's scale, or of the scatter of its picks."""
-    cause = three_point.cause_of_scale(fit.scale, fit.scale_sd, params.scale_limit_ppm, fit.scaled_dof)
-    if cause is None and fit.is_outlier:
-        cause = reason("stitch.picks-scatter", sd_mm=fit.sd_mm)
-    return () if cause is None else (cause,)
 
 
 def _unplaced(

@@ -168,12 +168,15 @@ def widened(sd: float, dof: float) -> float:
     return float(student_factor(dof)) * sd
 
 
-def as_pair(a: int, b: int, fit: PairFit, reasons: tuple[Reason, ...]) -> Pair:
-    """Convert the fit of scans a and b to a pair of the network."""
+def as_pair(a: int, b: int, fit: PairFit, limit_ppm: float) -> Pair:
+    """Convert the fit of scans a and b to a pair of the network, with the likely cause of its scale or scatter."""
+    cause = cause_of_scale(fit.scale, fit.scale_sd, limit_ppm, fit.scaled_dof)
+    if cause is None and fit.is_outlier:
+        cause = reason("stitch.picks-scatter", sd_mm=fit.sd_mm)
     residual = float(np.sqrt((fit.residuals**2).sum(axis=1).mean()))
     return Pair(
         a=a, b=b, shared=len(fit.residuals), T_a_b=fit.T_a_b, covariance=fit.covariance, residual=residual,
-        reasons=reasons, scale=fit.scale, scale_sd=widened(fit.scale_sd, fit.scaled_dof),
+        reasons=() if cause is None else (cause,), scale=fit.scale, scale_sd=widened(fit.scale_sd, fit.scaled_dof),
     )  # fmt: skip
 
 

@@ -15,7 +15,6 @@ from processor.jobs import process, runner
 from processor.jobs.causes import Cause
 from processor.jobs.child import Lost
 from processor.jobs.exit_codes import WITH_RESULTS
-from processor.jobs.make_scene_command import scene_command
 from processor.jobs.process import Ended
 from processor.results.file_names import RESULTS_JSON
 from processor.store.making import beside
@@ -87,12 +86,14 @@ def _results(spec: dict[str, Any], folder: Path, command: Callable[..., Ended]) 
 
 def _scene(spec: dict[str, Any], folder: Path, command: Callable[..., Ended]) -> Path:
     """Make the scene of a cell in a folder: a scene file, or by a foreign generator a scan folder."""
-    recipe, foreign = spec["recipe"], spec["origin"] == Origin.FOREIGN
+    recipe, foreign = spec["recipe"], spec["origin"] == Origin.FOREIGN  # foreign: the script that makes the scene
     if spec["recipe_text"]:
         recipe = folder / f"{recipe}.{'py' if foreign else 'toml'}"
         recipe.write_text(spec["recipe_text"], "utf-8")
     scene = folder / ("scene" if foreign else "scene.h5")
-    made = command(*scene_command(recipe, scene, spec["seed"], spec["settings"], foreign))
+    maker = (str(recipe), str(scene)) if foreign else ("designgen", "make", str(recipe), "-o", str(scene))
+    settings = (word for setting in spec["settings"] for word in ("--set", setting))
+    made = command(*maker, "--seed", str(spec["seed"]), *settings)
     if made.cause is not Cause.EXIT or made.code != 0:
         raise _FailedError(_reason(spec["recipe"] if foreign else "designgen make", made))
     return scene

@@ -69,18 +69,13 @@ def with_ends(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float) ->
     u = ends.points / np.linalg.norm(ends.points, axis=1)[:, None]
     y = np.hstack([ends.points, np.ones((len(u), 1)), u])
     rays = grouped_sums.summed((weight[:, None, None] * u[:, :, None] * y[:, None]).reshape(-1, 21), inverse, len(key))
-    piece = np.concatenate([blocks.piece, key // len(T)])
-    order = np.argsort(piece, kind="stable")
-    return Blocks(
-        piece=piece[order],
-        scan=np.concatenate([blocks.scan, key % len(T)])[order],
-        sums=np.vstack([blocks.sums, sums])[order],
-        count=np.concatenate([blocks.count, np.bincount(inverse).astype(float)])[order],
-        kind=np.concatenate([blocks.kind, np.full(len(key), FACE_END)])[order],
-        pieces=blocks.pieces,
-        rays=np.concatenate([blocks.rays, rays.reshape(-1, 3, 7)])[order],
-        face=np.concatenate([blocks.face, np.full(len(key), -1)])[order],
-    )
+    piece, scan = np.divmod(key, len(T))
+    of_ends = Blocks(
+        piece=piece, scan=scan, sums=sums, count=np.bincount(inverse).astype(float), kind=np.full(len(key), FACE_END),
+        pieces=blocks.pieces, rays=rays.reshape(-1, 3, 7), face=np.full(len(key), -1),
+    )  # fmt: skip
+    both = Blocks.concat([blocks, of_ends])
+    return both.take(np.argsort(both.piece, kind="stable"))
 
 
 def match(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float, clear: bool = False) -> Matches:

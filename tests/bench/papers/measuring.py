@@ -11,7 +11,6 @@ from processor import diagnostics
 from processor.jobs import process
 from processor.jobs.causes import Cause
 from processor.jobs.child import Loss, Lost
-from processor.jobs.make_scene_command import scene_command
 from processor.store.making import beside
 from processor.writers import step_clouds
 from tests.bench.papers import bolt_balls, defects, deviation, preassembly, stitching
@@ -63,7 +62,8 @@ def make_and_measure(
     started = time.monotonic()
     with beside(Path(scratch)) as made:
         scene = made / "scene.h5"
-        words = scene_command(data_set.recipe, scene, data_set.seed, data_set.settings)
+        words = ("designgen", "make", str(data_set.recipe), "-o", str(scene), "--seed", str(data_set.seed))
+        words += tuple(word for setting in data_set.settings for word in ("--set", setting))
         ended = process.run(
             (*process.GUARDED, "0", *words), env=process.environment(1), timeout_s=MAKING_S, stopped=stopped
         )
