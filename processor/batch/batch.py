@@ -10,7 +10,7 @@ import os
 import secrets
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +18,7 @@ from typing import Any
 
 from processor.batch import job as batch_job
 from processor.batch import summary
-from processor.batch.find_inputs import STATE, Inputs, find
+from processor.batch.find_inputs import STATE, Input, find
 from processor.batch.job import Job, OutputGoneError
 from processor.batch.record import JobStatus, Record
 from processor.jobs import process, runner
@@ -74,15 +74,15 @@ def run(settings: Settings, say: Callable[[str], None], ended: Callable[[Record]
     if out == root or root.is_relative_to(out):
         raise UsageError(f"{settings.out}: holds the inputs; name another folder for the results")
     check_folder(out / LOGS)
-    inputs = find(root, out)
-    for name in [each.name for each in inputs.inputs if each.name.split("/", 1)[0] in (*summary.FILES, LOGS)]:
-        inputs.left_out[name] = reason("batch.reserved-name")
-    inputs.inputs = [each for each in inputs.inputs if each.name not in inputs.left_out]
-    for name, why in sorted(inputs.left_out.items()):
+    found, left_out = find(root, out)
+    for name in [each.name for each in found if each.name.split("/", 1)[0] in (*summary.FILES, LOGS)]:
+        left_out[name] = reason("batch.reserved-name")
+    inputs = [each for each in found if each.name not in left_out]
+    for name, why in sorted(left_out.items()):
         say(f"{name}: left out: {messages('en').text(why)}")
-    if not inputs.inputs:
+    if not inputs:
         raise InputError(f"{settings.root}: expected scan folders, scenes or scans in it, found none")
-    around = next((each for each in inputs.inputs if out.is_relative_to(each.path)), None)
+    around = next((each for each in inputs if out.is_relative_to(each.path)), None)
     if around is not None:  # its own state and logs would be files of the input, which change while it is processed
         raise UsageError(
             f"{settings.out}: lies in the scan folder {around.path}; name a folder outside for the results"
@@ -103,7 +103,7 @@ def run(settings: Settings, say: Callable[[str], None], ended: Callable[[Record]
             with suppress(OSError):
                 (state / TOKEN).unlink()  # jobs that still run on a worker out of reach end themselves
             shutil.rmtree(state / "work", ignore_errors=True)
-        return summary.write(out, [(job, records[job.name]) for job in jobs], inputs.left_out, settings.lang)
+        return summary.write(out, [(job, records[job.name]) for job in jobs], left_out, settings.lang)
 
 
 def _records(
@@ -140,7 +140,7 @@ def _checked(job: Job, result: Record | Lost) -> Record:
     return Record(input=job.name, identity="", status=JobStatus.FAILED, reason=why)
 
 
-def _jobs(settings: Settings, inputs: Inputs, root: Path, out: Path, state: Path) -> list[Job]:
+def _jobs(settings: Settings, inputs: Sequence[Input], root: Path, out: Path, state: Path) -> list[Job]:
     """Make the list of jobs, and prepare the folder for them."""
     shutil.rmtree(state / "work", ignore_errors=True)
     for folder in ("failed", "work"):
@@ -152,14 +152,14 @@ def _jobs(settings: Settings, inputs: Inputs, root: Path, out: Path, state: Path
     if settings.params_toml:
         replace_text(state / "params.toml", settings.params_toml.decode("utf-8"))
         run_options = (*run_options, "--params", str(state / "params.toml"))
-    keys = {each.name: hashlib.sha256(os.fsencode(each.name)).hexdigest()[:32] for each in inputs.inputs}
+    keys = {each.name: hashlib.sha256(os.fsencode(each.name)).hexdigest()[:32] for each in inputs}
     remove_leftovers(state / "failed")  # of a batch that was killed while it wrote the record of a failure
     for path in (state / "failed").glob("*.json"):
         if path.stem not in keys.values():
             path.unlink()
     threads = max(1, (os.cpu_count() or 1) // settings.at_once)
     jobs = []
-    for each in inputs.inputs:
+    for each in inputs:
         key = keys[each.name]
         log = out / LOGS / f"{each.path.name if each.name == '.' else each.name}.log"
         units = ("--units", settings.units) if settings.units and not each.is_scene else ()

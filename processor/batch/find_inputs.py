@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from processor import readers
@@ -29,24 +29,17 @@ class Input:
     is_scene: bool = False
 
 
-@dataclass
-class Inputs:
-    """The inputs, and by name the reasons why other files and folders are left out."""
-
-    inputs: list[Input] = field(default_factory=list)
-    left_out: dict[str, Reason] = field(default_factory=dict)
-
-
-def find(root: Path, out: Path) -> Inputs:
+def find(root: Path, out: Path) -> tuple[list[Input], dict[str, Reason]]:
     """Find every input below ``root`` outside ``out``, in the order of their names; links are not followed.
+
+    Returned with them are, by name, the reasons why other files and folders are left out.
 
     A folder with project.toml or a design is one input with all its content. So is any other folder below ``root``
     with scans, in itself or in scans/, and no further inputs. If it has further inputs, each of its scan files is an
     input, as are those of ``root``.
     """
     left_out: dict[str, Reason] = {}
-    inputs = sorted(_search(root, "", out, left_out), key=lambda each: os.fsencode(each.name))
-    return Inputs(inputs, left_out)
+    return sorted(_search(root, "", out, left_out), key=lambda each: os.fsencode(each.name)), left_out
 
 
 def _search(folder: Path, name: str, out: Path, left_out: dict[str, Reason]) -> list[Input]:

@@ -17,12 +17,6 @@ from processor.store.codec import DecodeError
 
 AXES = ("x", "y", "z")
 NO_STATIONS = np.empty(0, np.int32)
-# Columns that came to the schema later, and are stored where they are not empty: shape of a row and type.
-NEWER = {
-    field.name: (field.metadata["shape"][1:], field.metadata["dtype"])
-    for field in dataclasses.fields(Scan)
-    if field.metadata.get("newer")
-}
 
 
 def write_scan(group: Any, scan: Scan) -> Ints:
@@ -79,31 +73,6 @@ def extreme_stations(group: Any, size: int = 1 << 20) -> Labels:
     return np.array([np.min(parts), np.max(parts)], np.int32) if parts else NO_STATIONS
 
 
-def count(group: Any) -> int:
-    """Return the number of points of a scan's group."""
-    return len(read_index(group).columns[0])
-
-
-def shape(group: Any, name: str) -> tuple[int, ...]:
-    """Return the shape of a per-point column of a scan's group."""
-    if name == "points":
-        return (count(group), 3)
-    return tuple(_column(group, name).shape)
-
-
-def _column(group: Any, name: str) -> Any:
-    absent = _absent(group)
-    if name in absent:
-        return absent[name]
-    field = next(f for f in dataclasses.fields(Scan) if f.name == name)
-    return codec.column(group, name, field.metadata["dtype"], len(field.metadata["shape"]))
-
-
-def _absent(group: Any) -> dict[str, Any]:
-    """Return the newer columns that a group has not, empty."""
-    return {name: np.empty((0, *shape), dtype) for name, (shape, dtype) in NEWER.items() if name not in group}
-
-
 @dataclasses.dataclass(frozen=True)
 class PointColumn:
     """The points (n, 3) of a scan's group, mm, to be read in slices. DecodeError for points that are not finite."""
@@ -111,9 +80,14 @@ class PointColumn:
     where: str
     stored: StoredTiles
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """The numbers of points and of coordinates."""
+        return len(self.stored.columns[0]), 3
+
     def __len__(self) -> int:
         """Return the number of points."""
-        return len(self.stored.columns[0])
+        return self.shape[0]
 
     def __getitem__(self, rows: slice) -> Floats:
         """Read points."""
@@ -126,7 +100,13 @@ class PointColumn:
 
 def column(group: Any, name: str) -> Any:
     """Return a per-point column of a scan's group, to be read in slices; one that is absent is empty."""
-    return PointColumn(group.name, read_index(group)) if name == "points" else _column(group, name)
+    if name == "points":
+        return PointColumn(group.name, read_index(group))
+    declared = next(field.metadata for field in dataclasses.fields(Scan) if field.name == name)
+    shape, dtype = declared["shape"], declared["dtype"]
+    if declared.get("newer") and name not in group:  # it came to the schema later, and is stored where it is not empty
+        return np.empty((0, *shape[1:]), dtype)
+    return codec.column(group, name, dtype, len(shape))
 
 
 def pieces(group: Any, name: str, size: int) -> Iterator[Any]:

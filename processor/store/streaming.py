@@ -34,7 +34,7 @@ class StoredPoints:
 
     def counts(self) -> tuple[int, ...]:
         """Return the number of points of each scan."""
-        return tuple(scan_tiles.count(scan) for scan in self.scans)
+        return tuple(len(scan_tiles.column(scan, "points")) for scan in self.scans)
 
     def read(self, scan: int, size: int = PIECE) -> Iterator[tuple[Floats, Labels]]:
         """Yield points (n, 3), relative to the scan's origin, and their stations: (n,), or empty where unknown."""
@@ -59,7 +59,7 @@ class StoredPoints:
 
     def pieces(self, scan: int, name: str) -> tuple[tuple[int, ...], Iterator[Any]]:
         """Return the shape of a per-point column and an iterator over it; see :func:`.store.scene_hash`."""
-        return scan_tiles.shape(self.scans[scan], name), scan_tiles.pieces(self.scans[scan], name, PIECE)
+        return self.column(scan, name).shape, scan_tiles.pieces(self.scans[scan], name, PIECE)
 
 
 @dataclass(frozen=True)

@@ -85,8 +85,8 @@ def processes_of(mark):
 
 
 def found_in(root, out="out"):
-    found = find_inputs.find(root, root / out)
-    return [one.name for one in found.inputs], found.left_out
+    found, left_out = find_inputs.find(root, root / out)
+    return [one.name for one in found], left_out
 
 
 def tree(root, *names):

@@ -61,7 +61,6 @@ class _End:
 @dataclass(frozen=True)
 class _Joint:
     name: str
-    plane: SectionPlane
     left: _End  # of the left part
     right: _End
     points: Floats  # P1..P8
@@ -184,8 +183,7 @@ def _joint(found: Assembly, number: int) -> _Joint | Reason:
     size = np.ptp(places, axis=0)
     if not (PLAUSIBLE_MM[0] < size.min() and size.max() < PLAUSIBLE_MM[1]):
         doubts.append(reason("init.section-unusual", width=size[0], height=size[1]))
-    points = key_points(plane, places[:KEY_CORNERS], places[KEY_CORNERS:] if left.is_round else None)
-    return _Joint(f"J{number + 1}", plane, left, right, points=points, doubts=tuple(doubts))
+    return _Joint(f"J{number + 1}", left, right, points=key_points(plane, places), doubts=tuple(doubts))
 
 
 def _normal(contact: Contact, a: Body, b: Body) -> Floats:
@@ -212,16 +210,16 @@ def _end(body: Body, face: PlaneFace, joint: SectionPlane, inward: float, way: F
     found = None if plane is None else corners(plane.flat(face.points), max(STRAIGHT_MM, 2.0 * body.step_mm))
     if plane is None or found is None:
         return None
-    places = np.vstack([found.places, found.middles])
+    places, doubt = found
     skin = skin_at_end(body, plane, inward)
     outward = np.broadcast_to(-inward * normal, (len(places), 3))
     if skin is None or len(skin[0]) != len(places):
-        return _End(plane.space(places), outward, found.doubt or reason("init.other-corners-behind"))
+        return _End(plane.space(places), outward, doubt or reason("init.other-corners-behind"))
     at_end, change = skin
     outward = outward + change[:, :1] * plane.left + change[:, 1:] * plane.up
     off = float(np.abs(at_end - places).max())
-    if found.doubt or off > SKIN_MM:
-        return _End(plane.space(at_end), outward, found.doubt or reason("init.off-outer-faces", mm=off))
+    if doubt or off > SKIN_MM:
+        return _End(plane.space(at_end), outward, doubt or reason("init.off-outer-faces", mm=off))
     return _End(plane.space(places), outward)
 
 

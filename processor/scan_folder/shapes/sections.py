@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -63,22 +63,11 @@ class SectionPlane:
         return self.origin + places[:, :1] * self.left + places[:, 1:] * self.up
 
 
-@dataclass(frozen=True)
-class Corners:
-    """Corners P1..P4 (4, 2) of a section in its plane, left and up; ``doubt``: why they are not clear.
-
-    ``middles`` (4, 2) are P5..P8 of a round section, whose P1..P4 are at 45 degrees on its edge; (0, 2) of any other.
-    """
-
-    places: Floats
-    doubt: Reason | None = None
-    middles: Floats = field(default_factory=lambda: np.empty((0, 2)))
-
-
-def corners(places: Floats, straight_mm: float = STRAIGHT_MM) -> Corners | None:
+def corners(places: Floats, straight_mm: float = STRAIGHT_MM) -> tuple[Floats, Reason | None] | None:
     """Return the corners of the hull of points (n, 2) in a section's plane; None where they enclose no area.
 
-    A side whose points are within ``straight_mm`` of a line is straight.
+    They are P1..P4 (4, 2), left and up, with the doubt why they are not clear; P1..P8 (8, 2) of a round section, P1..P4
+    at 45 degrees on its edge. A side whose points are within ``straight_mm`` of a line is straight.
     """
     if len(places) < 3:
         return None
@@ -88,7 +77,7 @@ def corners(places: Floats, straight_mm: float = STRAIGHT_MM) -> Corners | None:
         return None
     of_round = _round(hull, ROUND_MM + straight_mm)
     if of_round is not None:
-        return Corners(of_round[:4], middles=of_round[4:])
+        return of_round, None
     sharp = _of_rounded_corners(_without_straight(hull, COLLINEAR_MM))
     hull = _without_straight(hull, straight_mm) if sharp is None else sharp
     if len(hull) < 4:
@@ -98,8 +87,8 @@ def corners(places: Floats, straight_mm: float = STRAIGHT_MM) -> Corners | None:
     ways = np.array([[1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
     chosen = (unit @ ways.T).argmax(axis=0)
     if len(set(chosen.tolist())) < 4:
-        return Corners(hull[chosen], reason("init.no-corners-of-box", corners=len(hull)))
-    return Corners(hull[chosen], _doubt(hull[chosen], len(hull)))
+        return hull[chosen], reason("init.no-corners-of-box", corners=len(hull))
+    return hull[chosen], _doubt(hull[chosen], len(hull))
 
 
 def _round(hull: Floats, tolerance_mm: float) -> Floats | None:
@@ -186,11 +175,10 @@ def _doubt(four: Floats, count: int) -> Reason | None:
     return None
 
 
-def key_points(plane: SectionPlane, four: Floats, middles: Floats | None = None) -> Floats:
-    """Return P1..P8 (8, 3) of the corners P1..P4 (4, 2) in a section's plane; ``middles`` (4, 2) of a round one."""
-    if middles is None:
-        middles = 0.5 * (four + np.roll(four, -1, axis=0))
-    return plane.space(np.vstack([four, middles]))
+def key_points(plane: SectionPlane, places: Floats) -> Floats:
+    """Return P1..P8 (8, 3) of a section's corners in its plane: P1..P4 (4, 2), or P1..P8 (8, 2) of a round one."""
+    middles = 0.5 * (places + np.roll(places, -1, axis=0))
+    return plane.space(np.vstack([places, middles])[:8])
 
 
 def cut(body: Body, plane: SectionPlane) -> Floats:
@@ -213,10 +201,9 @@ def skin_at_end(body: Body, plane: SectionPlane, inward: float) -> tuple[Floats,
     -1. A bevel, or a flange around the end, has other corners than the skin.
     """
     inside = [corners(cut(body, plane.moved(inward * depth)), CHORDS_MM) for depth in DEPTHS_MM]
-    if any(one is None or one.doubt for one in inside):
+    clear = [one[0] for one in inside if one is not None and one[1] is None]
+    if len(clear) < len(inside) or len({len(one) for one in clear}) > 1:
         return None
-    if len({len(one.middles) for one in inside if one is not None}) > 1:
-        return None
-    places = np.array([np.vstack([one.places, one.middles]) for one in inside if one is not None])
+    places = np.array(clear)
     at_end = 3.0 * places[0] - 3.0 * places[1] + places[2]
     return at_end, (at_end - places[0]) / DEPTHS_MM[0]
