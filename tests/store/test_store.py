@@ -180,7 +180,7 @@ def test_the_source_of_a_unit_in_an_earlier_file_is_its_text(written):
 def test_reasons_without_the_values_of_their_text_are_a_fault_of_the_file(written):
     bad = np.array([b'{"code": "units.by-format", "values": {}}'])
     with pytest.raises(InputError, match=r"/scene/units_reason, row 0: expected the values of 'units.by-format'"):
-        store.read_scene(with_units_reason(written, bad, store.store.FORMAT_VERSION))
+        store.read_scene(with_units_reason(written, bad, store.FORMAT_VERSION))
 
 
 @pytest.mark.parametrize(
@@ -384,5 +384,5 @@ def test_an_error_of_a_file_in_a_folder_that_is_removed_names_its_place(tmp_path
 def test_faults_of_a_file_do_not_repeat_its_name(tmp_path):
     path = tmp_path / "a.h5"
     path.write_bytes(b"x")
-    assert all(str(path) not in fault for fault in store.store.problems(path))
-    assert store.store.damage(path)[1][0].startswith("expected a processor-scene or")
+    assert all(str(path) not in fault for fault in store.problems(path))
+    assert store.damage(path)[1][0].startswith("expected a processor-scene or")
