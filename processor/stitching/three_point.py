@@ -7,19 +7,23 @@ all matrices hold the scale: T_a_b = [lambda R, t].
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import fdtri, stdtrit
 
+from processor import diagnostics, large_arrays
 from processor.adjustment import data_snooping
 from processor.geometry import rigid
 from processor.model import NORMAL_95, Floats, Picks, Reason, Scan, reason
 from processor.robust_statistics import student_factor
 from processor.stitching import poses_with_scale
+from processor.stitching.coarse.network import CoarsePoses
 from processor.stitching.common_point_checks import LEAST_HEIGHT, units_slip
 from processor.stitching.fine.pairs_and_loops import Pair
+from processor.stitching.params import Params
+from processor.stitching.to_result import Network
 
 LEAST_SD_MM = 1e-6  # of picks without any error, as in tests
 BY_CHANCE = 1e-3  # probability that the picks of any pair of a network scatter so much
@@ -70,6 +74,82 @@ def by_pair(picks: Picks | None, scans: Sequence[Scan]) -> Picked:
         key: (np.array([xa for xa, _ in rows]), np.array([xb for _, xb in rows]))
         for key, rows in sorted(grouped.items())
     }
+
+
+def stitch(scans: Sequence[Scan], params: Params, reference: int, picked: Picked) -> Network:
+    """Register scans in the frame of scan ``reference``, a row of ``scans``, by the picks of their pairs."""
+    names = [scan.name for scan in scans]
+    origins = np.stack(
+        [scan.position if scan.position.size else scan.origin + large_arrays.centroid(scan.points) for scan in scans]
+    )
+    fits: dict[tuple[int, int], PairFit] = {}
+    shortages: dict[tuple[int, int], Reason] = {}
+    for (a, b), (in_a, in_b) in picked.items():
+        try:
+            fits[a, b] = fit_pair(in_a - origins[a], in_b - origins[b], params.scale == "free")
+        except TooFewError as error:
+            shortages[a, b] = error.shortage
+    each = pooled(list(fits.values())) if fits else []
+    limit = params.scale_limit_ppm
+    pairs = [as_pair(a, b, fit, limit) for (a, b), fit in zip(fits, each, strict=True)]
+    _say_pairs(names, each, pairs, picked)
+    unused = [
+        reason("stitch.pair-not-used", a=names[a], b=names[b], shortage=shortage)
+        for (a, b), shortage in shortages.items()
+    ]
+    of_pairs = [
+        reason("stitch.of-pair", a=names[pair.a], b=names[pair.b], reason=single)
+        for pair in pairs
+        for single in pair.reasons
+    ]
+    T, covariance, scale_sd, factor = adjust(pairs, len(scans), reference)
+    misclosed = () if factor == 1.0 else (reason("stitch.loops-misclose", factor=factor),)
+    return Network(
+        T=T,
+        covariance=covariance,
+        origins=origins,
+        coarse=CoarsePoses.unrivalled(T),
+        pairs=pairs,
+        pose_scale_sd=scale_sd,
+        unplaced=_unplaced(names, shortages, {row for pair in fits for row in pair}),
+        point_mm=float(np.median([fit.sd_mm for fit in each])) if each else float("nan"),
+        reasons=(*unused, *misclosed, *of_pairs),
+    )
+
+
+def _say_pairs(names: Sequence[str], fits: Sequence[PairFit], pairs: Sequence[Pair], picked: Picked) -> None:
+    """Say what the picks of each pair gave, for diagnostics."""
+    for fit, pair in zip(fits, pairs, strict=True):
+        of_pair = names[pair.a], names[pair.b]
+        with diagnostics.at(", ".join(of_pair)):
+            diagnostics.note(
+                "three points",
+                points=pair.shared,
+                rms_mm=pair.residual,
+                pick_sd_mm=fit.sd_mm,
+                scale_ppm=1e6 * (fit.scale - 1.0),
+            )
+            for name, points in zip(of_pair, picked[pair.a, pair.b], strict=True):
+                with diagnostics.placed(np.eye(4), f"scan {name}"):
+                    diagnostics.keep(f"picks in {name}", points)
+
+
+def _unplaced(
+    names: Sequence[str], shortages: Mapping[tuple[int, int], Reason], tied: Collection[int]
+) -> tuple[Reason, ...]:
+    """Return why each scan of three-point may have no pose: its pairs with too few picks, or no pairs at all."""
+    reasons = []
+    for row in range(len(names)):
+        short = tuple(
+            reason("stitch.shortage-with-scan", shortage=shortage, scan=names[a if row == b else b])
+            for (a, b), shortage in shortages.items()
+            if row in (a, b)
+        )
+        if short:
+            reasons.append(reason("stitch.too-few-picks", shortages=short))
+        else:
+            reasons.append(reason("stitch.picks-of-unplaced") if row in tied else reason("stitch.no-picks"))
+    return tuple(reasons)
 
 
 def fit_pair(points_a: Floats, points_b: Floats, scale_free: bool) -> PairFit:
@@ -180,22 +260,13 @@ def as_pair(a: int, b: int, fit: PairFit, limit_ppm: float) -> Pair:
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Adjusted:
-    """Poses T_ref_scan (k, 4, 4) of a network of pairs and their covariance (6k, 6k); NaN of scans not reached.
+def adjust(pairs: list[Pair], count: int, reference: int) -> tuple[Floats, Floats, Floats, float]:
+    """Adjust a network of pairs; initial poses are those of the paper's chain.
 
-    Rotations are about the scans' own origins, along the reference's axes. ``scale_sd`` (k,) is that of the scale in T,
-    0 where it is fixed. ``factor`` multiplied all standard deviations, as loops contradict the pairs' covariances.
+    Returns poses T_ref_scan (k, 4, 4) and their covariance (6k, 6k), NaN of scans not reached: rotations are about the
+    scans' own origins, along the reference's axes; the standard deviations (k,) of the scales in T, 0 where these are
+    fixed; and the factor of all standard deviations, 1 unless loops contradict the pairs' covariances.
     """
-
-    T: Floats
-    covariance: Floats
-    scale_sd: Floats
-    factor: float
-
-
-def adjust(pairs: list[Pair], count: int, reference: int) -> Adjusted:
-    """Adjust a network of pairs; initial poses are those of the paper's chain."""
     T = _chained(pairs, count, reference)
     m = len(pairs[0].covariance) if pairs else 6  # unknowns of a scan
     placed = np.flatnonzero(np.isfinite(T).all(axis=(1, 2))).tolist()
@@ -226,7 +297,7 @@ def adjust(pairs: list[Pair], count: int, reference: int) -> Adjusted:
     covariance *= factor**2
     of_motion = np.arange(m * count).reshape(count, m)[:, :6].ravel()
     scale_sd = np.sqrt(np.diag(covariance)[6::7]) if m == 7 else np.where(np.isfinite(T[:, 0, 0]), 0.0, np.nan)
-    return Adjusted(T=T, covariance=covariance[np.ix_(of_motion, of_motion)], scale_sd=scale_sd, factor=factor)
+    return T, covariance[np.ix_(of_motion, of_motion)], scale_sd, factor
 
 
 def _factor(pairs: list[Pair], T: Floats, unknowns: int) -> float:
