@@ -26,6 +26,7 @@ from processor.model import Status, Verdict
 from processor.model.inputs import keys_of
 from processor.scan_folder import project_file
 from processor.scan_folder.folder import read_input
+from tests.support import field_checks
 from tests.support.processes import batches
 from tests.support.scenes.coarse_scans import coarsely
 from tests.support.solids import cad_in_process
@@ -36,6 +37,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PROGRAMS = {"processor": processor.cli.main.commands, "designgen": designgen.cli.commands}
 README_LINES = 120
+FIRST_PAGE_WORDS = 600  # of a reader's first page
 LARGEST_PICTURE = 300_000
 # Commands of the pages that take seconds, in an order in which each finds what it needs; as they stand in the pages.
 RUN = (
@@ -92,6 +94,11 @@ ELSEWHERE = {
         "tests/pipeline/test_user_methods.py"
     ),
     "processor run my-frame -o results --steps density": "tests/pipeline/test_written_step.py",
+    "processor init my-bridge": "tests/test_docs.py",
+    "designgen make frame-small -o frame.h5 --seed 3": "tests/test_docs.py",
+    "processor run frame.h5 -o results --method ray,ransac": "tests/test_docs.py",
+    "designgen make frame-small -o set --count 2 --vary scan.sigma_mm=1,2": "tests/test_docs.py",
+    "processor batch set -o set-results --jobs 2": "tests/test_docs.py",
     "designgen make frame-1040 -o roof.h5 --seed 3": "make weekend",
     "designgen scan hall.ifczip -o hall.h5 --stations places.json --scanner pulse --set scan.step_mrad=0.5": (
         "tests/designgen/test_models.py"
@@ -260,6 +267,84 @@ def test_cheap_commands_run(place):
     assert (place / "merged/merged.laz").exists()
     assert (place / "deviation/deviation.ply").exists()
     assert read_input(place / "example").arch is not None
+
+
+def test_first_pages_are_short_and_stand_first():
+    index = (ROOT / "docs/index.md").read_text("utf-8").partition("## Reference")[0]
+    pages = sorted((ROOT / "docs/start").glob("*.md"))
+    assert re.findall(r"\]\(start/(\w+)\.md\)", index) == ["fabricator", "surveyor", "researcher", "night", "developer"]
+    assert len(pages) == 5
+    assert [path.name for path in pages if len(path.read_text("utf-8").split()) > FIRST_PAGE_WORDS] == []
+
+
+def bridge_to_send(folder):
+    """Make the demo's bridge as a fabricator has it: meshes and E57 files of the parts, and no more."""
+    invoke(f"designgen make arch-s1-short -o {folder}/bridge.h5 --set scan.spacing_mm=10")
+    invoke(f"designgen export {folder}/bridge.h5 -o {folder}/my-bridge --format e57 --without-truth")
+    for name in ("project.toml", "design.json"):
+        (folder / "my-bridge" / name).unlink()
+
+
+def frame_to_survey(folder):
+    """Make a merged cloud with a list of nodes, scans of spheres as targets, and one target."""
+    fixtures = ROOT / "fixtures"
+    (folder / "my-frame").mkdir()
+    np.savetxt(folder / "my-frame/roof.xyz", merged_cloud(fixtures / "scan-folder"), fmt="%.5f")
+    nodes = json.loads((fixtures / "scan-folder/design.json").read_text("utf-8"))["nodes"]
+    rows = [",".join(map(str, (one["id"], *one["centre"], one["radius"]))) for one in nodes]
+    (folder / "my-frame/nodes.csv").write_text("\n".join(["id,x,y,z,radius", *rows]), "utf-8")
+    (folder / "my-check").mkdir()
+    field_checks.folder(folder / "my-check", 1, view_mm=0.25)
+    shutil.copy(fixtures / "formats/ball.e57", folder / "target.e57")
+
+
+def folders_of_a_server(folder):
+    """Make two projects."""
+    for name in ("frame-1", "frame-2"):
+        shutil.copytree(ROOT / "fixtures/scan-folder", folder / "projects" / name)
+
+
+def checked_bridge(folder):
+    record = json.loads((folder / "results/results.json").read_text("utf-8"))
+    parts = {part["name"]: part["characteristics"] for part in record["steps"]["inspect"]["components"]}
+    (length,) = [one for one in parts["rib2"] if one["id"] == "length"]
+    assert record["verdict"] == "fail"
+    assert abs(length["deviation"] + 6.0) <= length["ci95"]  # asbuilt of the recipe: cut 6 mm short
+    assert (folder / "results/what-to-do.csv").exists()
+    assert len(list((folder / "assembled/scans").iterdir())) == 5
+
+
+def checked_survey(folder):
+    assert (folder / "my-scanner/scanner.toml").exists()
+    assert (folder / "merged/merged.laz").exists()
+
+
+def checked_research(folder):
+    exec("\n".join(blocks(ROOT / "docs/start/researcher.md", "python")), {})
+    assert len(list((folder / "set-results").glob("*/results.json"))) == 4
+
+
+def checked_night(folder):
+    assert len((folder / "all-results/summary.csv").read_text("utf-8").splitlines()) == 3
+    assert (folder / "nights/line.txt").exists()
+
+
+@pytest.mark.slow  # whole runs, as a reader does them
+@pytest.mark.parametrize(
+    ("reader", "make", "check"),
+    [
+        ("fabricator", bridge_to_send, checked_bridge),
+        ("surveyor", frame_to_survey, checked_survey),
+        ("researcher", lambda folder: None, checked_research),
+        ("night", folders_of_a_server, checked_night),
+    ],
+)
+def test_the_commands_of_a_first_page_run_as_they_stand(reader, make, check, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    make(tmp_path)
+    for line in blocks(ROOT / f"docs/start/{reader}.md", "console"):
+        invoke(line)
+    check(tmp_path)
 
 
 def anchors(path):
