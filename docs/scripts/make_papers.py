@@ -1,4 +1,4 @@
-"""Write the tables of docs/papers.md: ``python -m docs.scripts.make_papers OUT/papers.json``, of any files."""
+"""Write the lists of docs/papers.md: ``python -m docs.scripts.make_papers OUT/papers.json``, of any files."""
 
 from __future__ import annotations
 
@@ -20,24 +20,25 @@ def main() -> None:
 
 
 def tables(content: dict[str, Any]) -> list[str]:
-    """Return the lines of the tables, and of the reasons below each, which their rows number."""
+    """Return the lines of what was not reproduced or not made, with the reasons; papers.html of the command has all."""
     seeds = content["seeds"]
     papers = list(dict.fromkeys(row["paper"] for row in content["rows"]))
     lines = [f"Papers {', '.join(papers)}: {content['line']}."]
     lines = [f"{lines[0]} Ours is the median (worst) over the seeds."] if seeds > 1 else lines
     for paper in papers:
-        rows = [row for row in content["rows"] if row["paper"] == paper]
+        rows = [row for row in content["rows"] if row["paper"] == paper and row["reproduced"] in ("no", "not made")]
         reasons = list(dict.fromkeys(row["reason"]["text"] for row in rows))
-        lines += ["", f"### Paper {paper}", ""]
-        lines += ["| place | data set | method | figure | published | ours (worst) | reproduced | reason |"]
-        lines += ["|---|---|---|---|---|---|---|---|"]
+        if not rows:
+            continue
+        lines += ["", f"### Paper {paper}", "", "| place | of | figure | published | ours | reason |"]
+        lines += ["|---|---|---|---|---|---|"]
         for row in rows:
             unit = f" {row['unit']}" if row["unit"] else ""
-            ours = f"{number(row['median'])} ({number(row['worst'])}){unit}"
-            published = "" if row["published"] is None else number(row["published"]) + unit
+            worst = f" ({number(row['worst'])})" if seeds > 1 else ""
             cells = (
-                row["place"], row["data"], row["method"], row["quantity"], published,
-                ours if row["median"] is not None else "–", row["reproduced"] or "",
+                row["place"], ", ".join(one for one in (row["data"], row["method"]) if one), row["quantity"],
+                "" if row["published"] is None else number(row["published"]) + unit,
+                "–" if row["median"] is None else number(row["median"]) + worst + unit,
                 str(reasons.index(row["reason"]["text"]) + 1),
             )  # fmt: skip
             lines.append("| " + " | ".join(cells) + " |")
