@@ -1,7 +1,7 @@
 """Write docs/parameters.md from the code: ``python -m docs.scripts.make_parameters`` from the root of the repository.
 
-The type and default of a parameter are those of its field. Its meaning is the comment beside the field, else the
-sentence of the record's docstring that names it, else MEANINGS.
+The default of a parameter is that of its field. Its meaning is the comment beside the field, else the sentence of the
+record's docstring that names it, else MEANINGS. What every step has, ``method`` and ``seed``, stands at the head.
 """
 
 from __future__ import annotations
@@ -37,15 +37,14 @@ radii_mm = [45.0, 50.0, 60.0]
 processor run my-frame -o results --params mine.toml
 ```
 
-An unknown name, a wrong type or a number outside its range ends the run with exit code 2. Names end in their unit:
-`_mm`, `_mrad`, `_deg`, `_ppm`, `_C`; others are counts, ratios or texts. `nan` in the column of defaults means
-"not given". The seed of the command line replaces that of the file.
+An unknown name, a wrong type or a number outside its range ends the run with exit code 2. A value has the type of its
+default: text, true or false, whole number, number (`1.0`, `nan` = not given), list of numbers. Names end in their unit:
+`_mm`, `_mrad`, `_deg`, `_ppm`, `_C`. Every step also has `method` (the first that is named, unless `--method` says
+otherwise) and `seed` (0; the command line's comes first).
 """
-NAMES = {bool: "true or false", int: "whole number", float: "number", str: "text"}
+OF_ALL_STEPS = ("method", "seed")
 # Of fields that neither a comment nor the docstring explains.
 MEANINGS = {
-    "method": "method of the step; `--method` on the command line comes first",
-    "seed": "seed of all random numbers of the step",
     "deviation.projection_diameter_mm": "diameter of the M3C2 cylinder; 0 = from the density",
     "deviation.max_depth_mm": "half length of the M3C2 cylinder; 0 = from the scan's extent",
     "deviation.core_spacing_mm": "distance between core points; 0 = from the density",
@@ -97,7 +96,7 @@ def page() -> str:
         lines.append(f"\n## Step `{step}`\n\nMethods: {', '.join(f'`{name}`' for name in module.METHODS)}.\n")
         for name, record in records(step, type(module.Params())):
             lines.append(f"\n### `[{name}]`\n\n{first_paragraph(record)}\n")
-            lines.append("| name | default | type | meaning |\n|---|---|---|---|")
+            lines.append("| name | default | meaning |\n|---|---|---|")
             lines += [f"| {' | '.join(row)} |" for row in rows(name, record)]
             lines.append("")
     return re.sub(r"\n{3,}", "\n\n", "\n".join(lines)).rstrip() + "\n"
@@ -113,18 +112,17 @@ def records(name: str, record: type) -> Iterator[tuple[str, type]]:
             yield from records(f"{name}.{field.name}", type(value))
 
 
-def rows(table: str, record: type) -> list[tuple[str, str, str, str]]:
-    """Return name, default, type and meaning of every field that is no record."""
+def rows(table: str, record: type) -> list[tuple[str, str, str]]:
+    """Return name, default and meaning of every field that is no record and that not every step has."""
     default, comments = record(), comments_of(record)
     found = []
     for field in dataclasses.fields(record):
         value = getattr(default, field.name)
-        if dataclasses.is_dataclass(value):
+        if dataclasses.is_dataclass(value) or field.name in OF_ALL_STEPS:
             continue
-        kind = "list of numbers" if isinstance(value, tuple) else NAMES[type(value)]
         shown = "nan" if value != value else json.dumps(value, ensure_ascii=False)
         meaning = comments.get(field.name) or sentence(record, field.name) or known(table, field.name)
-        found.append((f"`{field.name}`", f"`{shown}`", kind, escaped(meaning)))
+        found.append((f"`{field.name}`", f"`{shown}`", escaped(meaning)))
     return found
 
 
