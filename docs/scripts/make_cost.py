@@ -69,7 +69,7 @@ def tables(content: dict[str, Any]) -> list[str]:
 def series_row(series: dict[str, Any]) -> str:
     """One row: the values of all sizes with slashes between."""
     keys = ("size", "points", "step", "cpu", "wall", "mb")
-    columns = [" / ".join(figure(row[key]) for row in series["rows"]) for key in keys]
+    columns = ["/".join(figure(row[key]) for row in series["rows"]) for key in keys]
     if series["over"] == "points":
         columns[1] = ""
     bytes_ = series["bytes a point"]
@@ -103,8 +103,8 @@ def peer_row(row: dict[str, Any], *further: str) -> str:
 
 
 def figure(value: float) -> str:
-    """Write a number with two or three digits: 12, 3.4, 250 k, 1.6 M."""
-    for unit, name in ((1e6, " M"), (1e3, " k")):
+    """Write a number with two or three digits: 12, 3.4, 250k, 1.6M."""
+    for unit, name in ((1e6, "M"), (1e3, "k")):
         if value >= unit and (unit > 1e3 or value >= 1e4):
             return f"{value / unit:.3g}{name}" if value / unit < 100 else f"{value / unit:.0f}{name}"
     return f"{value:.0f}" if value >= 100.0 or value == int(value) else f"{value:.2g}"

@@ -22,9 +22,9 @@ PAGE = Path(__file__).resolve().parents[1] / "parameters.md"
 HEAD = """\
 # Parameters
 
-This page is generated from the code by `make docs`; do not edit it by hand.
+Generated from the code by `make docs`.
 
-Parameters are given in a TOML file, one table per step, nested records as tables within it:
+Parameters are given in a TOML file, one table per step:
 
 ```toml
 [preassemble.adjust]
@@ -96,8 +96,7 @@ def page() -> str:
         lines.append(f"\n## Step `{step}`\n\nMethods: {', '.join(f'`{name}`' for name in module.METHODS)}.\n")
         for name, record in records(step, type(module.Params())):
             lines.append(f"\n### `[{name}]`\n\n{first_paragraph(record)}\n")
-            lines.append("| name | default | meaning |\n|---|---|---|")
-            lines += [f"| {' | '.join(row)} |" for row in rows(name, record)]
+            lines += ["- {} ({}): {}".format(*row) for row in rows(name, record)]
             lines.append("")
     return re.sub(r"\n{3,}", "\n\n", "\n".join(lines)).rstrip() + "\n"
 
@@ -170,8 +169,8 @@ def first_paragraph(record: type) -> str:
 
 
 def escaped(text: str) -> str:
-    """Return text for a cell of a table."""
-    return text.replace("``", "`").replace("|", "\\|")
+    """Return a docstring's text in the marks of Markdown."""
+    return text.replace("``", "`")
 
 
 if __name__ == "__main__":

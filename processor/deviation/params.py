@@ -35,7 +35,8 @@ class Params(Parameters, table="deviation"):
 
     method: str = METHODS[0]
     seed: int = 0
-    # none: the frame as it is; fine: from where it is; coarse: from anywhere; auto: see README
+    # none: the frame as it is; fine: from where it is; coarse: from anywhere; auto: none if half of the scan is near
+    # the design, else coarse
     register: str = entry(text(*REGISTER), default="auto")
     # a scan that is registered is fitted to: the largest part that agrees (stable); all: best fit
     fit: str = entry(text(*FIT), default="stable")
