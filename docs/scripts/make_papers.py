@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import sys
 from pathlib import Path
@@ -32,18 +33,33 @@ def tables(content: dict[str, Any]) -> list[str]:
             continue
         lines += ["", f"### Paper {paper}", "", "| place | of | figure | published | ours | reason |"]
         lines += ["|---|---|---|---|---|---|"]
-        for row in rows:
-            unit = f" {row['unit']}" if row["unit"] else ""
-            worst = f" ({number(row['worst'])})" if seeds > 1 else ""
+        groups = itertools.groupby(rows, lambda row: (row["place"], row["data"], row["method"], row["reason"]["text"]))
+        for (place, data, method, reason), alike in groups:
+            few = list(alike)
             cells = (
-                row["place"], ", ".join(one for one in (row["data"], row["method"]) if one), row["quantity"],
-                "" if row["published"] is None else number(row["published"]) + unit,
-                "–" if row["median"] is None else number(row["median"]) + worst + unit,
-                str(reasons.index(row["reason"]["text"]) + 1),
+                place, ", ".join(one for one in (data, method) if one), "; ".join(row["quantity"] for row in few),
+                "; ".join(published(row) for row in few), "; ".join(ours(row, seeds) for row in few),
+                str(reasons.index(reason) + 1),
             )  # fmt: skip
             lines.append("| " + " | ".join(cells) + " |")
         lines += ["", *(f"{i}. {reason[:1].upper()}{reason[1:]}." for i, reason in enumerate(reasons, 1))]
     return lines
+
+
+def published(row: dict[str, Any]) -> str:
+    """Write the published value with its unit."""
+    return "" if row["published"] is None else number(row["published"]) + unit_of(row)
+
+
+def ours(row: dict[str, Any], seeds: int) -> str:
+    """Write the median with its unit, and of several seeds the worst."""
+    worst = f" ({number(row['worst'])})" if seeds > 1 else ""
+    return "–" if row["median"] is None else number(row["median"]) + worst + unit_of(row)
+
+
+def unit_of(row: dict[str, Any]) -> str:
+    """Write a unit after its number."""
+    return f" {row['unit']}" if row["unit"] else ""
 
 
 def number(value: float | None) -> str:
