@@ -292,7 +292,7 @@ def frame_to_survey(folder):
     np.savetxt(folder / "my-frame/roof.xyz", merged_cloud(fixtures / "scan-folder"), fmt="%.5f")
     nodes = json.loads((fixtures / "scan-folder/design.json").read_text("utf-8"))["nodes"]
     rows = [",".join(map(str, (one["id"], *one["centre"], one["radius"]))) for one in nodes]
-    (folder / "my-frame/nodes.csv").write_text("\n".join(["id,x,y,z,radius", *rows]), "utf-8")
+    (folder / "my-frame/nodes.csv").write_text("\n".join(["id,x_mm,y_mm,z_mm,radius_mm", *rows]), "utf-8")
     (folder / "my-check").mkdir()
     field_checks.folder(folder / "my-check", 1, view_mm=0.25)
     shutil.copy(fixtures / "formats/ball.e57", folder / "target.e57")
