@@ -33,18 +33,14 @@ class Paper(Parameters, table="defects.paper"):
 
 @dataclass(frozen=True)
 class Params(Parameters, table="defects"):
-    """Parameters of both methods.
-
-    ``reach_mm`` is the distance from the design within which a point belongs to it. ``false_alarms`` is the number of
-    false alarms allowed on ``per_m2`` of surface. ``cell_mm`` = 0: by the density of the points.
-    """
+    """Parameters of both methods."""
 
     method: str = METHODS[0]
     seed: int = 0
-    reach_mm: float = entry(SIZE, default=60.0)
-    cell_mm: float = entry(AMOUNT, default=0.0)
-    false_alarms: float = entry(SIZE, default=1.0)
-    per_m2: float = entry(SIZE, default=100.0)
+    reach_mm: float = entry(SIZE, default=60.0)  # distance from the design within which a point belongs to it
+    cell_mm: float = entry(AMOUNT, default=0.0)  # of the surface; 0 = by the density of the points
+    false_alarms: float = entry(SIZE, default=1.0)  # allowed on per_m2
+    per_m2: float = entry(SIZE, default=100.0)  # of surface
     # systematic error of a surface by the scanner, one sd, however many points
     systematic_mm: float = entry(AMOUNT, default=0.02)
     # border of every face that is left out: beams there hit other faces too
