@@ -17,8 +17,7 @@ class AdjustParams(Parameters, table="preassemble.adjust"):
 
     # lambda: of a squared departure of the edges from the design, against a squared gap
     weight: float = entry(number(above=0, infinite=True), default=0.1)
-    # of the place in the design, each axis, of what no measured joint ties to the rest; default: half of 1/3000 of
-    # 60 m, the limit of an erected arch rib in height (processor/limits/jtg-arch-rib.toml)
+    # of the designed place, each axis, of what no measured joint ties to the rest; half of 60 m / 3000 (JTG arch rib)
     place_sd_mm: float = entry(number(above=0), default=10.0)
 
 
@@ -30,8 +29,7 @@ class SystematicParams(Parameters, table="preassemble.systematic"):
     offset_mm: float = entry(AMOUNT, default=0.0)  # zero offset of the scanner
     scale_ppm: float = entry(AMOUNT, default=0.0)
     temperature_C: float = entry(AMOUNT, default=0.0)  # of the steel's stated temperature
-    # of a difference of temperature across a part while it was scanned, along each of both axes; default: of 0 to 10 K
-    # in any direction; 0: none
+    # of a difference of temperature across a part, along each of both axes: 0 to 10 K in any direction; 0: none
     gradient_K: float = entry(AMOUNT, default=4.1)
 
     @property
