@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 import processor
 from designgen.scanning import processing
-from processor.adjustment.scanner_class_errors import INSTRUMENTS
+from processor.adjustment.scanner_class_errors import CLASSES
 from processor.model import NORMAL_95, Scan, Scene, Status, Truth
 
 RADIUS, RANGE = 75.0, 10_000.0
@@ -62,7 +62,7 @@ def drawn(rng, condition, cap, noise, spacing):
         cosine[stub] = np.maximum(z[stub] / STUB, LEAST_COS)
         seen |= stub
     points, cosine = np.column_stack([x, y, z])[seen], cosine[seen]
-    known = INSTRUMENTS["phase"]
+    known = CLASSES["phase"]
     sizes = known.incidence_mm if condition == "grazing-bias" else known.incidence_mm * rng.standard_normal()
     off = known.view_mm * rng.standard_normal() + sizes * (1.0 / cosine - 1.0)
     if condition == "heavy-tails":  # Student's with 3 degrees of freedom, of the same standard deviation
