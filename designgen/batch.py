@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from designgen import __version__, card, recipe_files
+from designgen.card import Content
 from processor.jobs import process, runner
 from processor.jobs.child import Loss, Lost
 from processor.jobs.software import check_same, versions
@@ -31,8 +32,11 @@ from processor.model import InputError, UsageError
 from processor.plain_text import printable, spreadsheet_text
 
 INDEX = "index.csv"
-# Columns of the index by their numbers in the card.
-NUMBERS = {"surface": "points_surface", "mixed": "points_mixed", "outlier": "points_outlier", "defects": "defects"}
+# Columns of the index by the fields of a content.
+COUNTS = {
+    "points": "points", "scans": "scans", "surface": "points_surface", "mixed": "points_mixed",
+    "outlier": "points_outlier", "defects": "defects",
+}  # fmt: skip
 MOST_SCENES = 99_999  # in one folder: file names number them by five digits
 MOST_SEED = 2**63  # seeds are stored as int64
 SOFTWARE = ("h5py", "numba", "numpy", "scipy")  # packages that a scene's bytes depend on; CAD solids are no part of it
@@ -80,17 +84,6 @@ def _provenance(name: str, recipe: recipe_files.Recipe, seed: int, software: dic
 
 
 # --- the jobs ---------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Content:
-    """A scene file in the index; both hashes in hex."""
-
-    scans: int
-    points: int
-    scene_hash: str
-    sha256: str
-    numbers: card.Numbers
 
 
 @dataclass(frozen=True)
@@ -263,8 +256,13 @@ def _content(path: Path, digest: str | None = None) -> Content:
     points = sum(len(scan.points) for scan in scene.scans)
     truth = store.read_truth(path)
     assert truth is not None  # every scene is written with it
-    numbers = card.numbers_of(truth)
-    return Content(len(scene.scans), points, store.scene_hash(scene), digest or checksums.of_file(path), numbers)
+    return Content(
+        scans=len(scene.scans),
+        points=points,
+        scene_hash=store.scene_hash(scene),
+        sha256=digest or checksums.of_file(path),
+        **card.numbers_of(truth),
+    )
 
 
 # --- the folder -------------------------------------------------------------------------------------------------------
@@ -384,9 +382,8 @@ def _read_index(path: Path) -> dict[str, Content]:
     try:
         for row in csv.DictReader(io.StringIO(path.read_text("utf-8"), newline="")):
             with suppress(KeyError, TypeError, ValueError):  # of a failed scene, or edited
-                numbers = card.Numbers(**{name: int(row[column]) for name, column in NUMBERS.items()})
-                content = Content(int(row["scans"]), int(row["points"]), row["scene_hash"], row["sha256"], numbers)
-                contents[row["file"]] = content
+                counts = {name: int(row[column]) for name, column in COUNTS.items()}
+                contents[row["file"]] = Content(**counts, scene_hash=row["scene_hash"], sha256=row["sha256"])
     except (OSError, UnicodeDecodeError, csv.Error):
         return {}
     return contents
@@ -395,20 +392,14 @@ def _read_index(path: Path) -> dict[str, Content]:
 def _index(jobs: Sequence[Job], keys: Sequence[str], outcomes: Mapping[str, Outcome]) -> str:
     text = io.StringIO(newline="")
     table = csv.writer(text, lineterminator="\n")
-    columns = ["points", "scans", *NUMBERS.values(), "scene_hash", "sha256"]
-    table.writerow(["file", "recipe", "seed", "split", *keys, *columns, "status", "reason"])
+    columns = {**COUNTS, "scene_hash": "scene_hash", "sha256": "sha256"}
+    table.writerow(["file", "recipe", "seed", "split", *keys, *columns.values(), "status", "reason"])
     for job in jobs:
         outcome = outcomes[job.file]
-        content = outcome.content
-        cells: list[Any] = [""] * len(columns)
-        if content:
-            numbers = [getattr(content.numbers, name) for name in NUMBERS]
-            cells = [content.points, content.scans, *numbers, content.scene_hash, content.sha256]
-        status = "done" if content else "failed"
+        cells = [getattr(outcome.content, name) if outcome.content else "" for name in columns]
+        status, reason = "done" if outcome.content else "failed", spreadsheet_text(outcome.reason)
         split = card.split_of(job.seed)
-        table.writerow(
-            [job.file, job.recipe, job.seed, split, *job.varied, *cells, status, spreadsheet_text(outcome.reason)]
-        )
+        table.writerow([job.file, job.recipe, job.seed, split, *job.varied, *cells, status, reason])
     return text.getvalue()
 
 
@@ -422,10 +413,9 @@ def _card(
 ) -> dict[str, Any]:
     from processor.store import store
 
-    contents = [(job, content) for job in jobs if (content := outcomes[job.file].content)]
-    entries = [card.Entry(job.seed, content.scans, content.points, content.numbers) for job, content in contents]
-    truth = store.read_truth(folder / contents[0][0].file) if contents else None
+    made = [(job, content) for job in jobs if (content := outcomes[job.file].content)]
+    truth = store.read_truth(folder / made[0][0].file) if made else None
     labels = card.labels_of(truth) if truth else []
-    digest = hashlib.sha256(index.encode()).hexdigest()
-    failed = len(jobs) - len(contents)
-    return card.of_set(jobs[0].recipe, recipe, varied, jobs[0].software, entries, failed, labels, digest)
+    digest, scenes = hashlib.sha256(index.encode()).hexdigest(), [(job.seed, content) for job, content in made]
+    failed = len(jobs) - len(made)
+    return card.of_set(jobs[0].recipe, recipe, varied, jobs[0].software, scenes, failed, labels, digest)

@@ -44,23 +44,17 @@ MEANINGS = {
 
 
 @dataclass(frozen=True)
-class Numbers:
-    """Counts of a scene for the index and the card: points by source, and defects in the truth."""
+class Content:
+    """A scene file in the index: scans, points, these by source, defects in the truth, and hashes in hex."""
 
+    scans: int
+    points: int
     surface: int
     mixed: int
     outlier: int
     defects: int
-
-
-@dataclass(frozen=True)
-class Entry:
-    """A scene of the set that was made."""
-
-    seed: int
-    scans: int
-    points: int
-    numbers: Numbers
+    scene_hash: str
+    sha256: str
 
 
 def split_of(seed: int) -> str:
@@ -68,13 +62,13 @@ def split_of(seed: int) -> str:
     return SPLITS.get(seed % TURN, TRAIN)
 
 
-def numbers_of(truth: Truth) -> Numbers:
+def numbers_of(truth: Truth) -> dict[str, int]:
     """Count the points of a scene by their source, and its defects."""
     of_source = Counter[int]()
     for label in truth.labels:
         of_source.update({row: int((label.source == row).sum()) for row in range(len(SOURCES))})
     counts = {name: of_source[row] for row, name in enumerate(SOURCES)}
-    return Numbers(**counts, defects=0 if truth.defects is None else len(truth.defects.ids))
+    return {**counts, "defects": 0 if truth.defects is None else len(truth.defects.ids)}
 
 
 def labels_of(truth: Truth) -> list[dict[str, Any]]:
@@ -115,17 +109,21 @@ def of_set(
     recipe: Mapping[str, Any],
     varied: Mapping[str, Sequence[str]],
     software: Mapping[str, str],
-    entries: Sequence[Entry],
+    scenes: Sequence[tuple[int, Content]],
     failed: int,
     labels: Sequence[Mapping[str, Any]],
     index_sha256: str,
 ) -> dict[str, Any]:
-    """Return the card of a set of scenes of a recipe as JSON holds it; ``varied`` has the texts of values by key."""
+    """Return the card of a set of ``scenes``, by their seeds, of a recipe as JSON holds it.
+
+    ``varied`` has the texts of values by key.
+    """
     try:
         noise = noise_of(recipe)
     except UsageError as error:  # no scene was made
         noise = {"law": f"none: {error}"}
-    points = [entry.points for entry in entries]
+    seeds, contents = [seed for seed, _ in scenes], [content for _, content in scenes]
+    points = [content.points for content in contents]
     return {
         "format": FORMAT,
         "version": FORMAT_VERSION,
@@ -134,18 +132,18 @@ def of_set(
         "kind": recipe.get("kind", ""),
         "parameters": dict(recipe),
         "varied": {key: list(values) for key, values in varied.items()},
-        "scenes": len(entries),
+        "scenes": len(scenes),
         "failed": failed,
-        "seeds": sorted({entry.seed for entry in entries}),
-        "scans": sum(entry.scans for entry in entries),
+        "seeds": sorted(set(seeds)),
+        "scans": sum(content.scans for content in contents),
         "points": {"all": sum(points), "least": min(points, default=0), "most": max(points, default=0)},
-        "points_by_source": {key: sum(getattr(entry.numbers, key) for entry in entries) for key in SOURCES},
-        "defects": sum(entry.numbers.defects for entry in entries),
+        "points_by_source": {key: sum(getattr(content, key) for content in contents) for key in SOURCES},
+        "defects": sum(content.defects for content in contents),
         "noise": noise,
         "labels": list(labels),
         "splits": {
             "rule": SPLIT_RULE,
-            "scenes": {key: sum(split_of(entry.seed) == key for entry in entries) for key in (TRAIN, VALIDATION, TEST)},
+            "scenes": {key: sum(split_of(seed) == key for seed in seeds) for key in (TRAIN, VALIDATION, TEST)},
         },
         "software": dict(software),
         "index": {"file": "index.csv", "sha256": index_sha256},

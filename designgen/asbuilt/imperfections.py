@@ -105,6 +105,11 @@ class Ledger:
         """Add a row."""
         self.rows.append((imperfection, where, float(value), unit))
 
+    def note_corners(self, what: str, where: str, corners: Floats) -> None:
+        """Add rows of what the corners P1 to P4 (4, 3) of an end are off along, to the left and up, mm."""
+        for k, axis in np.ndindex(4, 3):
+            self.note(f"{what} P{k + 1}, {('along', 'left', 'up')[axis]}", where, corners[k, axis], "mm")
+
     def record(self) -> AsBuilt:
         """Return the rows as the truth's record."""
         imperfection, where, value, unit = zip(*self.rows, strict=True) if self.rows else ((), (), (), ())
@@ -241,10 +246,7 @@ def _of_table(part: ArchPart, number: int, params: ArchParams, ledger: Ledger) -
     corners = np.zeros((2, 4, 3))
     if params.gap_table_mm and number:
         corners[0] = np.reshape(params.gap_table_mm, (-1, 4, 3))[number - 1]
-        for k, axis in np.ndindex(4, 3):
-            ledger.note(
-                f"gap P{k + 1}, {('along', 'left', 'up')[axis]}", f"{part.name} start", corners[0, k, axis], "mm"
-            )
+        ledger.note_corners("gap", f"{part.name} start", corners[0])
     return corners
 
 
@@ -264,9 +266,8 @@ def _draw_errors(
         ledger.note("length error", f"{part.name} {end}", ends[i, 0], "mm")
         ledger.note("skew about the vertical", f"{part.name} {end}", ends[i, 1], "rad")
         ledger.note("skew about the horizontal", f"{part.name} {end}", ends[i, 2], "rad")
-        for k, axis in np.ndindex(4, 3) if params.corner_mm else ():
-            corner = f"corner P{k + 1}, {('along', 'left', 'up')[axis]}"
-            ledger.note(corner, f"{part.name} {end}", corners[i, k, axis], "mm")
+        if params.corner_mm:
+            ledger.note_corners("corner", f"{part.name} {end}", corners[i])
     for size, value in zip(("bow sideways", "bow upward", "width", "height"), (*bow, *section), strict=True):
         ledger.note(size, part.name, value, "mm")
     ledger.note("twist", part.name, twist, "rad")

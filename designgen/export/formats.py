@@ -151,12 +151,8 @@ def write_all(
         else:
             cloud = labelled(scan, labels) if format_ in LABELLED else of_scan(scan)
             WRITERS[format_](folder / name, cloud)
-        written.append(Written(name, (scan,), ((stem, scan, _all_rows(scan)),)))
+        written.append(Written(name, (scan,), ((stem, scan, np.arange(len(scan.points))),)))
     return written
-
-
-def _all_rows(scan: Scan) -> Ints:
-    return np.arange(len(scan.points))
 
 
 def _write_e57(
@@ -164,7 +160,7 @@ def _write_e57(
 ) -> Written:
     e57.write(folder / f"{stem}.e57", [labelled(scan, labels) for scan in scans], spherical=spherical)
     names = [stem] if len(scans) == 1 else e57.names_read(stem, [scan.name for scan in scans])
-    read_as = tuple((name, scan, _all_rows(scan)) for name, scan in zip(names, scans, strict=True))
+    read_as = tuple((name, scan, np.arange(len(scan.points))) for name, scan in zip(names, scans, strict=True))
     return Written(f"{stem}.e57", tuple(scans), read_as)
 
 

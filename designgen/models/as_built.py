@@ -62,7 +62,7 @@ def build(model: Model, params: Mapping[str, Params], seed: int) -> Built:
         for what, value, unit in deviation.notes:
             ledger.note(what, body.name, value, unit)
     movement = _structure_truth(model, params, sampled)
-    return Built(tuple(built), movement, _defect_truth(defects), ledger.record() if params else None)
+    return Built(tuple(built), movement, defect_truth(defects), ledger.record() if params else None)
 
 
 class _SampledBody(NamedTuple):
@@ -93,7 +93,8 @@ def _structure_truth(model: Model, params: Mapping[str, Params], of_bodies: Sequ
     )
 
 
-def _defect_truth(defects: Sequence[Defect]) -> DefectTruth:
+def defect_truth(defects: Sequence[Defect]) -> DefectTruth:
+    """Return defects as the truth of a scene."""
     return DefectTruth(
         ids=np.arange(len(defects)),
         classes=tuple(defect.kind for defect in defects),

@@ -13,24 +13,13 @@ from designgen.checks import expect
 from designgen.designs import bolt_holes
 from designgen.designs import girder_assemblies as design_of
 from designgen.designs.prismatic_parts import EndErrors, Part
-from designgen.randomness import generator, random_pose
+from designgen.randomness import generator
 from designgen.recipe_params import filled
 from designgen.rigid import inverse
-from designgen.scanning import sampler, surroundings, survey
+from designgen.scanning import sampler, surroundings
 from designgen.scanning.scan_settings import ByRays, Scanning
-from designgen.scanning.surfaces import Builder
-from designgen.scanning.survey import Survey
-from designgen.scenes import MADE_IN_MM
-from processor.model import (
-    ArchDesign,
-    ArchTruth,
-    DesignPart,
-    Floats,
-    PointLabels,
-    Scan,
-    Scene,
-    Truth,
-)
+from designgen.scenes.separate_parts import SeparateScans
+from processor.model import ArchDesign, ArchTruth, DesignPart, Floats, Scene, Truth
 
 
 @dataclass(frozen=True)
@@ -52,49 +41,28 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
     ledger = Ledger()
     nominal, parts = built(recipe, seed, ledger)
     names = tuple(part.name for part in parts)
-    scans, labels, poses, ends = [], [], [], []
-    surveys: list[Survey] = []
+    apart = SeparateScans(names, scanning, seed)
+    poses, ends = [], []
     for number, part in enumerate(parts):
-        T = random_pose(generator(seed, f"pose {part.name}"))
+        box = _box(part)
+        T = apart.pose(part.name, box)
         if isinstance(scanning, ByRays):
-            box = _box(part)
-            T = T if scanning.surroundings is None else box.levelled(T)  # by a scanner on the same floor
-            surveyed = _surveyed(part, box, number, names, scanning, seed)
-            before = sum(len(one.registered) for one in surveys)
-            scan, label = survey.merged(surveyed, part.name, T, before, part.name)
-            surveys.append(survey.moved(surveyed, T))
+            apart.add_survey(scanning, part.built(), box, T)
         else:
             patches = [(number, patch) for patch in part.built()]
-            cloud = sampler.scan_patches(patches, scanning, generator(seed, f"scan {part.name}"))
-            points = cloud.points @ T[:3, :3].T + T[:3, 3]
-            scan = Scan(part.name, points, component=part.name, sigma_mm=scanning.sigma_mm)
-            label = PointLabels(part.name, names, cloud.part, cloud.source)
-        scans.append(scan)
-        labels.append(label)
+            apart.add_samples(sampler.scan_patches(patches, scanning, generator(seed, f"scan {part.name}")), T)
         poses.append(inverse(T))
         for end in part.ends:
             corners = end.key_points()
             displaced = corners + part.displacement(corners)
             ends.append((number, end.joint, end.outward, displaced @ T[:3, :3].T + T[:3, 3], displaced))
-    stations = survey.joined_truth([one.truth for one in surveys]) if surveys else None
-    scene = Scene(
-        name,
-        "arch-bridge",
-        tuple(scans),
-        arch=_design(nominal),
-        stations=survey.stations_of(stations.ids, np.concatenate([one.registered for one in surveys]))
-        if stations
-        else None,
-        units="mm",
-        units_reason=MADE_IN_MM,
-    )
+    stations, station_truth = apart.stations()
+    scene = Scene(name, "arch-bridge", tuple(apart.scans), arch=_design(nominal), stations=stations)
     return scene, Truth(
-        tuple(labels),
+        tuple(apart.labels),
         arch=_truth(nominal, names, poses, ends),
-        stations=stations,
+        stations=station_truth,
         as_built=ledger.record() if "asbuilt" in recipe else None,
-        spacing_mm=scanning.spacing_mm,
-        sigma_mm=scanning.sigma_mm,
     )
 
 
@@ -135,19 +103,6 @@ def _box(part: Part) -> surroundings.Box:
     return surroundings.Box(T[:3, :3].T, middle, 0.5 * (high - low))
 
 
-def _surveyed(
-    part: Part, box: surroundings.Box, number: int, names: tuple[str, ...], scanning: ByRays, seed: int
-) -> Survey:
-    """Scan one part as built from stations around it, in the bridge's frame."""
-    builder = Builder()
-    for patch in part.built():
-        builder.patch(number, patch)
-    about = scanning.surroundings
-    poses = survey.stations_around_box(box, scanning.params, seed, f"{part.name}/", on_floor=about is not None)
-    surroundings.add(builder, about, box, poses, seed, part.name)
-    return survey.survey(builder.to_surfaces(), names, poses, scanning.device, scanning.params, seed)
-
-
 def _built(part: Part, errors: Errors, rng: np.random.Generator, ledger: Ledger) -> Part:
     """Draw the errors of a part's ends, and add them to the ledger."""
     scale = np.array([errors.length_mm, 1e-3 * errors.skew_mrad, 1e-3 * errors.skew_mrad])
@@ -160,8 +115,7 @@ def _built(part: Part, errors: Errors, rng: np.random.Generator, ledger: Ledger)
             ("length error", "skew about z", "skew about y"), plane, ("mm", "rad", "rad"), strict=True
         ):
             ledger.note(what, where, value, unit)
-        for k, axis in np.ndindex(4, 3):
-            ledger.note(f"corner P{k + 1}, {('along', 'left', 'up')[axis]}", where, corners[k, axis], "mm")
+        ledger.note_corners("corner", where, corners)
     return part.with_errors(drawn)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,7 +14,7 @@ from designgen.recipe_params import filled
 from designgen.scanning import processing
 from designgen.scanning.scan_settings import Scanning, scan_settings_of
 from designgen.scenes import arch_bridge, assembly, model, space_frame, structure, target_room
-from processor.model import Scene, Truth, UsageError
+from processor.model import Scene, Truth, UsageError, reason
 
 Maker = Callable[[str, Mapping[str, Any], Scanning, int], tuple[Scene, Truth]]
 MAKERS: dict[str, tuple[str, Maker]] = {
@@ -54,7 +55,10 @@ def make(
         raise UsageError(f"recipe {name}: seed: expected a whole number from 0, got {used!r}")
     # The number of BLAS threads changes the order of its sums, and with it the last bits.
     with threadpool_limits(1, user_api="blas"):
-        made = maker(name, recipe, scan_settings_of(recipe), used)
+        scanning = scan_settings_of(recipe)
+        made, truth = maker(name, recipe, scanning, used)
+        made = replace(made, units="mm", units_reason=(reason("units.made-in-mm"),))
+        truth = replace(truth, spacing_mm=scanning.spacing_mm, sigma_mm=scanning.sigma_mm)
         if "processing" not in recipe:
-            return made
-        return processing.process(*made, filled(processing.Params, recipe, "processing"), used)
+            return made, truth
+        return processing.process(made, truth, filled(processing.Params, recipe, "processing"), used)

@@ -22,7 +22,6 @@ from designgen.scanning import scanner as scanner_module
 from designgen.scanning import surroundings, survey
 from designgen.scanning.scan_settings import ByRays, Scanning
 from designgen.scanning.surfaces import Builder
-from designgen.scenes import MADE_IN_MM
 from processor.model import Scene, StructureDesign, Truth, UsageError
 
 if TYPE_CHECKING:
@@ -99,8 +98,6 @@ def make(
         "structure",
         scans,
         stations=stations if params.registered else None,
-        units="mm",
-        units_reason=MADE_IN_MM,
         structure=StructureDesign(model.name, vertices + origin, faces, model.design_bodies()),
     )
     return scene, Truth(
@@ -109,8 +106,6 @@ def make(
         defects=dataclasses.replace(built.defects, centres=built.defects.centres + origin),
         stations=station_truth,
         as_built=built.ledger,
-        spacing_mm=scanning.spacing_mm,
-        sigma_mm=scanning.sigma_mm,
     )
 
 

@@ -14,7 +14,6 @@ from designgen.recipe_params import filled
 from designgen.scanning import clutter, sampler, space_frame_surfaces, surroundings, survey
 from designgen.scanning.scan_settings import ByRays, Scanning
 from designgen.scanning.surfaces import Builder
-from designgen.scenes import MADE_IN_MM
 from processor.model import FrameDesign, FrameTruth, PointLabels, Scan, Scene, Truth
 
 
@@ -59,14 +58,10 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         frame=design,
         stations=stations,
         temperature_C=imperfections.stated(errors.temperature_C),
-        units="mm",
-        units_reason=MADE_IN_MM,
     )
     return scene, Truth(
         labels,
         frame=FrameTruth(ids, built.centres + origin, built.radii, lowest + origin),
         stations=station_truth,
         as_built=ledger.record() if "asbuilt" in recipe else None,
-        spacing_mm=scanning.spacing_mm,
-        sigma_mm=scanning.sigma_mm,
     )

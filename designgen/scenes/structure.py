@@ -14,12 +14,13 @@ from designgen.asbuilt import imperfections
 from designgen.designs import boxes_and_tubes, defect_specimens, structure_registry
 from designgen.designs.parametric_face import Displacement, Patch
 from designgen.low_discrepancy import van_der_corput
+from designgen.models import as_built
+from designgen.models.body_deviations import Defect
 from designgen.randomness import generator
 from designgen.recipe_params import filled
 from designgen.scanning import clutter, picking, sampler, scanner, surroundings, survey
 from designgen.scanning.scan_settings import ByRays, Scanning
 from designgen.scanning.surfaces import Builder
-from designgen.scenes import MADE_IN_MM
 from processor.model import (
     AsBuilt,
     Bools,
@@ -101,8 +102,6 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         "structure",
         scans,
         stations=stations,
-        units="mm",
-        units_reason=MADE_IN_MM,
         structure=StructureDesign(kind, vertices + origin, faces),
         picks=picks,
     )
@@ -112,8 +111,6 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         defects=defects and dataclasses.replace(defects, centres=defects.centres + origin),
         stations=station_truth,
         as_built=_ledger(kind, recipe),
-        spacing_mm=scanning.spacing_mm,
-        sigma_mm=scanning.sigma_mm,
     )
 
 
@@ -183,17 +180,11 @@ def _plates(components: Components, recipe: Mapping[str, Any], seed: int) -> Bui
             (part, patch) for patch in asbuilt_defects.damaged(place, defect_specimens.bodies(form, place), defect)
         ]
         placed.append((place, defect))
-    centres = [place.origin + np.array([*defect.place, 0.0]) @ defect_specimens.AXES for place, defect in placed]
-    truth = DefectTruth(
-        ids=np.arange(len(placed)),
-        classes=tuple(defect.kind for _, defect in placed),
-        components=tuple(place.name for place, _ in placed),
-        centres=np.array(centres).reshape(-1, 3),
-        area_mm2=np.array([defect.area_mm2 for _, defect in placed]),
-        depth_max_mm=np.array([defect.depth_max_mm for _, defect in placed]),
-        volume_mm3=np.array([defect.volume_mm3 for _, defect in placed]),
-    )
-    return Built(patches, defects=truth, of_defects=partial(_defects_of, placed))
+    of_bodies = []
+    for place, defect in placed:
+        centre, size = place.origin + np.array([*defect.place, 0.0]) @ defect_specimens.AXES, defect.area_mm2
+        of_bodies.append(Defect(defect.kind, place.name, centre, size, defect.depth_max_mm, volume=defect.volume_mm3))
+    return Built(patches, defects=as_built.defect_truth(of_bodies), of_defects=partial(_defects_of, placed))
 
 
 def _defects_of(placed: Sequence[PlacedDefect], at: Floats, label: PointLabels) -> Labels:

@@ -15,7 +15,6 @@ from designgen.recipe_params import filled
 from designgen.scanning import survey
 from designgen.scanning.scan_settings import ByRays, Scanning
 from designgen.scanning.surfaces import Builder
-from designgen.scenes import MADE_IN_MM
 from processor.model import Control, Floats, Scene, TargetKind, TargetSearch, TargetTruth, Truth, UsageError
 
 WALL, FLOOR, STEEL, WHITE, BLACK = 1.1, 0.7, 0.5, 1.8, 0.1  # multiples of the scan's reflectance
@@ -99,16 +98,13 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
     if not params.registered:
         scans = tuple(dataclasses.replace(scan, T_project_scan=np.empty(0)) for scan in scans)
     scene = Scene(
-        name, "structure", scans, stations=stations if params.registered else None, units="mm", units_reason=MADE_IN_MM,
+        name, "structure", scans, stations=stations if params.registered else None,
         control=Control(tuple(ids), positions=known, sd=np.full(len(ids), room.surveyed_mm)) if ids else None,
         target_search=TargetSearch(
             room.checkerboard_mm if room.checkerboards else np.nan, room.sphere_radius_mm if room.spheres else np.nan
         ),
     )  # fmt: skip
-    return scene, Truth(
-        labels, stations=truth, targets=TargetTruth(tuple(ids), tuple(map(str, kinds)), positions),
-        spacing_mm=scanning.spacing_mm, sigma_mm=scanning.sigma_mm,
-    )  # fmt: skip
+    return scene, Truth(labels, stations=truth, targets=TargetTruth(tuple(ids), tuple(map(str, kinds)), positions))
 
 
 def _room(builder: Builder, room: Params) -> list[_Face]:
