@@ -6,7 +6,7 @@ that, and ends that touch in the assembly were scanned apart.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -80,6 +80,20 @@ def of_bridge(scene: Scene, assembled: Any, step: str) -> Iterator[PartScene]:
             shrink = 1.0 / thermal.expansion(scene.temperature_C) if assembled.method == ADJUSTED else 1.0
             structure = _structure(scene, part, placed, shrink)
             yield PartScene(part.name, structure, Status.AMBIGUOUS if ambiguous else Status.OK, (*doubts, *remarks))
+
+
+def together(parts: Sequence[PartScene], results: Sequence[Any]) -> tuple[Status, tuple[Reason, ...]]:
+    """Return the status of the ``results`` of all parts as one, and why: the first reason of each doubtful part."""
+    states = [result.status for result in results]
+    sure = Status.OK if all(one is Status.OK for one in states) else Status.WEAK
+    some = Status.PARTIAL if Status.FAILED in states else sure
+    status = Status.FAILED if all(one is Status.FAILED for one in states) else some
+    doubts = [
+        reason("parts.of-part", part=part.name, why=result.reasons[:1])
+        for part, result in zip(parts, results, strict=True)
+        if result.status is not Status.OK and result.reasons
+    ]
+    return status, (reason("parts.each-at-its-best-fit"), *doubts)
 
 
 def _structure(scene: Scene, part: DesignPart, placed: list[_Placed], shrink: float) -> Scene:

@@ -19,7 +19,7 @@ from processor.adjustment import robust_least_squares, scanner_class_errors
 from processor.adjustment.body_motions import distance_derivative, transform_about, variances
 from processor.adjustment.elimination import eliminate
 from processor.defects.observations import Pairs
-from processor.defects.surface_charts import CYLINDER, DesignSurface, chart_of_cells
+from processor.defects.surface_charts import CYLINDER, DesignSurface
 from processor.geometry import rigid
 from processor.model import Bools, Columns, Floats, Ints
 from processor.robust_statistics import CAUCHY, cauchy, robust_sd
@@ -128,7 +128,7 @@ def align(
     points = surface.centres[blocks.cell]
     rays = rays_to(points, stations.positions[blocks.station])
     J = distance_derivative(points - start.centre, surface.outward[blocks.cell], rays)
-    component = surface.charts.component[chart_of_cells(surface)[blocks.cell]]
+    component = surface.component[blocks.cell]
     used = ~np.isin(component, sorted(excluded))
     enough = len(np.unique(component[used])) >= FEWEST_COMPONENTS
     compared = _of_one_place(blocks, J, points - start.centre, rays, component, surface)
@@ -157,7 +157,7 @@ def _of_one_place(
     off along the face by the deviation times the tangent of incidence, to either side for stations on either side, and
     the deviation changes along it as the tube moved. Each component is taken as a rigid body.
     """
-    chart = chart_of_cells(surface)[blocks.cell]
+    chart = surface.chart[blocks.cell]
     around = np.cross(surface.charts.axes[chart, 0], surface.outward[blocks.cell])
     out, along = np.zeros(len(blocks.mean)), np.zeros(len(blocks.mean))
     for number in np.unique(component):
@@ -258,7 +258,7 @@ def rays_to(points: Floats, positions: Floats) -> Floats:
 def _blocks(pairs: Pairs, surface: DesignSurface) -> StationBlocks:
     """Sum up pairs of cell and station by blocks of cells."""
     charts = surface.charts
-    chart = chart_of_cells(surface)[pairs.cell]
+    chart = surface.chart[pairs.cell]
     used = pairs.count > 0
     u, v = np.divmod(pairs.cell - charts.first[chart], charts.shape[chart, 1])
     wide = np.where(charts.kind == CYLINDER, np.minimum(BLOCK_MM, BLOCK_RAD * charts.radius), BLOCK_MM)

@@ -11,10 +11,9 @@ from scipy.special import chdtrc, ndtr, ndtri
 
 from processor.adjustment import scanner_class_errors
 from processor.defects import shape_models
-from processor.defects.alignment import Alignment
-from processor.defects.deviation_field import Field, component_of_cells
+from processor.defects.deviation_field import Field
 from processor.defects.scan_statistic import Levels
-from processor.defects.surface_charts import DesignSurface, chart_of_cells
+from processor.defects.surface_charts import DesignSurface
 from processor.distinct_rows import distinct
 from processor.model import NORMAL_95, Floats, Ints
 
@@ -59,9 +58,9 @@ class SignificantShape:
     margin: float  # chi-square of the best fit of another kind less this one's
 
 
-def fit_all(field: Field, surface: DesignSurface) -> list[ComponentShape]:
+def fit_all(field: Field) -> list[ComponentShape]:
     """Fit the shapes of all components with enough observed blocks."""
-    component = component_of_cells(surface)
+    surface, component = field.surface, field.surface.component
     seen = np.flatnonzero(field.seen > 0)
     order = np.argsort(component[seen], kind="stable")
     shapes = []
@@ -72,11 +71,11 @@ def fit_all(field: Field, surface: DesignSurface) -> list[ComponentShape]:
         frame = _frame_of(surface, number)
         block_mm = min(2.0 * frame.half[0] / BLOCKS_ALONG, 2.0 * frame.half[1] / BLOCKS_ACROSS)
         side = max(1, round(max(block_mm / surface.charts.cell_mm, np.sqrt(len(cells) / MOST_BLOCKS))))
-        blocks = _blocks_of(field, surface, cells, side)
+        blocks = _blocks_of(field, cells, side)
         if len(blocks.mean) >= FEWEST_BLOCKS:
             fitted = shape_models.fit(blocks, frame)
             if fitted.shapes and side > 1:
-                fine = _blocks_of(field, surface, cells, max(1, side // FINER))
+                fine = _blocks_of(field, cells, max(1, side // FINER))
                 # Finer blocks have the weights by which the fit left out blocks.
                 if (fitted.weight < blocks.weight).any():
                     nearest = cKDTree(blocks.points).query(fine.points)[1]
@@ -95,7 +94,7 @@ def deformed(shapes: list[ComponentShape]) -> frozenset[int]:
 def values(surface: DesignSurface, shapes: list[ComponentShape], chosen: dict[int, list[shape_models.Shape]]) -> Floats:
     """Return the deviation (cells,) by the chosen shapes of each component, mm."""
     total = np.zeros(len(surface.share))
-    component = component_of_cells(surface)
+    component = surface.component
     for fit in shapes:
         if chosen.get(fit.component):
             rows = np.flatnonzero(component == fit.component)
@@ -107,7 +106,7 @@ def values(surface: DesignSurface, shapes: list[ComponentShape], chosen: dict[in
 def jumps(surface: DesignSurface, shapes: list[ComponentShape], chosen: dict[int, list[shape_models.Shape]]) -> Ints:
     """Return the cells that the edge of a step runs through: their means mix both sides."""
     cells = [np.empty(0, np.int64)]
-    component = component_of_cells(surface)
+    component = surface.component
     for fit in shapes:
         for shape in chosen.get(fit.component, ()):
             if shape.kind == "step":
@@ -119,12 +118,7 @@ def jumps(surface: DesignSurface, shapes: list[ComponentShape], chosen: dict[int
 
 
 def significant(
-    shapes: list[ComponentShape],
-    surface: DesignSurface,
-    field: Field,
-    alignment: Alignment,
-    levels: Levels,
-    alarms_per_mm2: float,
+    shapes: list[ComponentShape], field: Field, levels: Levels, alarms_per_mm2: float
 ) -> dict[int, list[SignificantShape]]:
     """Return the shapes, by component, that are significant at the given rate of false alarms.
 
@@ -133,15 +127,15 @@ def significant(
     that the shape's factors may bring out (Scheffe 1953); its interval is that where it is largest, which may be a
     corner that was not seen.
     """
-    chosen: dict[int, list[SignificantShape]] = {}
+    chosen, surface = dict[int, list[SignificantShape]](), field.surface
     for fit in shapes:
         candidates = [shape for shape in fit.fitted.shapes if shape.kind != "bump"]
         if not candidates:
             continue
-        front = front_of(surface, fit.component, field)
+        front = front_of(field, fit.component)
         area = float(surface.share[front[surface.share[front] > 0.5]].sum()) * surface.charts.cell_mm**2
         threshold = max(LEAST_Z, float(-ndtri(min(0.25, 0.5 * alarms_per_mm2 * area / len(shape_models.BASES)))))
-        of_all = [judged(fit, shape, surface, field, alignment, levels) for shape in candidates]
+        of_all = [judged(fit, shape, field, levels) for shape in candidates]
         found = [
             dataclasses.replace(one, chance=2.0 * float(ndtr(-one.z)) * len(shape_models.BASES) / area)
             for one in of_all
@@ -152,23 +146,17 @@ def significant(
     return chosen
 
 
-def judged(
-    fit: ComponentShape,
-    shape: shape_models.Shape,
-    surface: DesignSurface,
-    field: Field,
-    alignment: Alignment,
-    levels: Levels,
-) -> SignificantShape:
+def judged(fit: ComponentShape, shape: shape_models.Shape, field: Field, levels: Levels) -> SignificantShape:
     """Return a shape with its interval, whether or not it is significant; ``chance`` is left to the search."""
+    surface = field.surface
     # Noise of blocks; the common error of larger places is added below.
     size = int(np.searchsorted(levels.sides, fit.blocks.side_mm / surface.charts.cell_mm))
     inflation = float(levels.inflation[min(size, len(levels.sides) - 1)])
-    value, own, noise, shared = _errors(fit, shape, surface, field, alignment, levels)
+    value, own, noise, shared = _errors(fit, shape, field, levels)
     sd = np.hypot(inflation * noise, shared)
     top = int(np.argmax(np.abs(value)))
     # The noise of places averages out in the volume, what they have in common does not.
-    cells = swept_cells(surface, field, fit, shape)
+    cells = swept_cells(field, fit, shape)
     points, outward = surface.centres[cells], surface.outward[cells]
     # 0 where the shape does not reach
     swept = np.sign(shape.values(fit.frame, points, outward)) * surface.cell_areas[cells]
@@ -186,19 +174,14 @@ def judged(
 
 
 def _errors(
-    fit: ComponentShape,
-    shape: shape_models.Shape,
-    surface: DesignSurface,
-    field: Field,
-    alignment: Alignment,
-    levels: Levels,
+    fit: ComponentShape, shape: shape_models.Shape, field: Field, levels: Levels
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return a shape's values (n,) at cells and corners, those that its significance is of, and their errors.
 
     These are one sd: by the noise of blocks, and what places have in common.
     """
-    rows = cells_of_shape(surface, field, fit, shape)
-    points, outward = with_corners(surface, rows)
+    rows = cells_of_shape(field, fit, shape)
+    points, outward = with_corners(field.surface, rows)
     value = own = shape.values(fit.frame, points, outward)
 
     def moved(mean: Floats) -> Floats:
@@ -206,8 +189,8 @@ def _errors(
         motion = shape_models.rigid_motion(dataclasses.replace(fit.blocks, mean=mean), fit.frame)
         return motion.values(fit.frame, points, outward)
 
-    registration = np.hypot(alignment.sd(points, outward), field.stations_sd(rows))
-    if shape.kind != shape_models.RIGID and not alignment.fitted:
+    registration = np.hypot(field.alignment.sd(points, outward), field.stations_sd(rows))
+    if shape.kind != shape_models.RIGID and not field.alignment.fitted:
         # The error of a pose that was not fitted to the design may be large: it moves, it does not deform.
         own = value - moved(shape.values(fit.frame, fit.blocks.points, fit.blocks.outward))
         registration = np.full_like(value, field.stations_sd(rows, free=True))
@@ -248,22 +231,20 @@ def deviate_of_one(z: float, factors: int) -> float:
     return float(-ndtri(0.5 * chance)) if chance > LEAST_CHANCE else z
 
 
-def cells_of_shape(
-    surface: DesignSurface, field: Field, fit: ComponentShape, shape: shape_models.Shape | None = None
-) -> Ints:
+def cells_of_shape(field: Field, fit: ComponentShape, shape: shape_models.Shape | None = None) -> Ints:
     """Return the cells on which a shape is measured: the front, or the seen face on which a movement is largest.
 
     A component that moved along its front shows it on other faces alone.
     """
-    front = front_of(surface, fit.component, field)
+    surface, front = field.surface, front_of(field, fit.component)
     front = front[surface.share[front] > 0.5]
     if shape is None or shape.kind != shape_models.RIGID:
         return front
-    seen = np.flatnonzero((component_of_cells(surface) == fit.component) & (field.seen > 0.0))
-    charts, index, count = np.unique(chart_of_cells(surface)[seen], return_inverse=True, return_counts=True)
+    seen = np.flatnonzero((surface.component == fit.component) & (field.seen > 0.0))
+    charts, index, count = np.unique(surface.chart[seen], return_inverse=True, return_counts=True)
     value = np.abs(shape.values(fit.frame, surface.centres[seen], surface.outward[seen]))
     mean = np.where(count >= FEWEST_SEEN, np.bincount(index.reshape(-1), value) / np.maximum(count, 1), 0.0)
-    on_front = np.isin(charts, chart_of_cells(surface)[front])
+    on_front = np.isin(charts, surface.chart[front])
     if not len(charts) or mean.max() <= max(FACE_GAIN * mean[on_front].max(initial=0.0), 1e-9):
         return front
     of_face = surface.charts.cells(int(charts[int(np.argmax(mean))]))
@@ -272,15 +253,15 @@ def cells_of_shape(
     return shown if len(shown) else front
 
 
-def swept_cells(surface: DesignSurface, field: Field, fit: ComponentShape, shape: shape_models.Shape) -> Ints:
+def swept_cells(field: Field, fit: ComponentShape, shape: shape_models.Shape) -> Ints:
     """Return the cells that sweep the volume of a shape.
 
     Of a movement these are cells of all faces that were seen, where they go inward or where they come out, whichever
     sweeps more: the opposite faces sweep the same volume.
     """
     if shape.kind != shape_models.RIGID:
-        return cells_of_shape(surface, field, fit, shape)
-    chart = chart_of_cells(surface)
+        return cells_of_shape(field, fit, shape)
+    surface, chart = field.surface, field.surface.chart
     count = np.bincount(chart[field.seen > 0.0], minlength=len(surface.charts.kind))
     of_component = surface.charts.component[chart] == fit.component
     cells = np.flatnonzero(of_component & (count[chart] >= FEWEST_SEEN) & (surface.share > 0.5))
@@ -290,11 +271,11 @@ def swept_cells(surface: DesignSurface, field: Field, fit: ComponentShape, shape
     return larger
 
 
-def front_of(surface: DesignSurface, component: int, field: Field) -> Ints:
+def front_of(field: Field, component: int) -> Ints:
     """Return the cells of the largest face and of those in its plane; of equal faces that with most cells observed."""
-    charts = surface.charts
+    charts, share = field.surface.charts, field.surface.share
     candidates = np.flatnonzero(charts.component == component)
-    areas = np.array([float(surface.share[charts.cells(int(k))].sum()) for k in candidates])
+    areas = np.array([float(share[charts.cells(int(k))].sum()) for k in candidates])
     seen = np.array([float(field.seen[charts.cells(int(k))].sum()) for k in candidates])
     large = areas > LARGE_SHARE * areas.max()
     main = candidates[int(np.argmax(np.where(large, seen, -1.0)))]
@@ -325,10 +306,10 @@ def _frame_of(surface: DesignSurface, component: int) -> shape_models.Frame:
     return shape_models.Frame(0.5 * (low + high) @ axes, axes, half, max(0.5 * float(np.ptp(front)), 1.0))
 
 
-def _blocks_of(field: Field, surface: DesignSurface, cells: Ints, side: int) -> shape_models.Blocks:
+def _blocks_of(field: Field, cells: Ints, side: int) -> shape_models.Blocks:
     """Sum up the cells of one component by squares of ``side`` cells."""
-    charts = surface.charts
-    chart = chart_of_cells(surface)[cells]
+    surface, charts = field.surface, field.surface.charts
+    chart = surface.chart[cells]
     u, v = np.divmod(cells - charts.first[chart], charts.shape[chart, 1])
     index = distinct(np.stack([chart, u // side, v // side], axis=1)).number
     w = 1.0 / field.variance[cells]
@@ -344,7 +325,7 @@ def _blocks_of(field: Field, surface: DesignSurface, cells: Ints, side: int) -> 
 
 def with_corners(surface: DesignSurface, cells: Ints) -> tuple[Floats, Floats]:
     """Return places (n, 3) and normals (n, 3) of cells and of the corners of their faces, where shapes are largest."""
-    on_faces = np.isin(surface.chart_of, np.unique(chart_of_cells(surface)[cells]))
+    on_faces = np.isin(surface.chart_of, np.unique(surface.chart[cells]))
     corners = surface.vertices[surface.faces[on_faces]].reshape(-1, 3)
     normals = np.repeat(surface.normals[on_faces], 3, axis=0)
     return np.concatenate([surface.centres[cells], corners]), np.concatenate([surface.outward[cells], normals])

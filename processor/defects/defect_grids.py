@@ -9,7 +9,6 @@ import numpy as np
 
 from processor.defects.deviation_field import Field
 from processor.defects.result import Curve, Picture, SurfacePlaces
-from processor.defects.surface_charts import DesignSurface, chart_of_cells
 from processor.model import NORMAL_95, Floats, Ints
 
 MOST_SIDE = 120  # cells of a picture
@@ -21,15 +20,12 @@ MOST_PLACES = 50_000  # of the whole surface
 SMALL_PLACES, MOST_SMALL_PLACES = 400, 10_000  # of one defect that is not thinned, and of all such
 
 
-def of_surface(
-    defects: Sequence[Ints], field: Field, surface: DesignSurface, origin: Floats, most: int = MOST_PLACES
-) -> SurfacePlaces:
+def of_surface(defects: Sequence[Ints], field: Field, origin: Floats, most: int = MOST_PLACES) -> SurfacePlaces:
     """Return places all over the surface, shifted by ``origin`` (3,); ``defects`` are the cells of each defect.
 
     Of every face each s-th row and column of cells is taken, s the same for all; of small defects every cell.
     """
-    charts = surface.charts
-    chart = chart_of_cells(surface)
+    surface, charts, chart = field.surface, field.surface.charts, field.surface.chart
     defect_of = np.full(len(chart), -1, np.int32)
     for row in sorted(range(len(defects)), key=lambda row: -len(defects[row])):  # small ones on top of large ones
         defect_of[defects[row]] = row
@@ -55,27 +51,25 @@ def _each(index: Ints, count: Ints, step: int) -> Any:
     return index % step == np.minimum(step, count) // 2
 
 
-def of_defects(defects: Sequence[tuple[Floats, Ints, Field, int]], surface: DesignSurface) -> tuple[Picture, ...]:
+def of_defects(defects: Sequence[tuple[Floats, Ints, Field, int]]) -> tuple[Picture, ...]:
     """Return a picture of each defect, given by its centre (3,), cells, deviations and component.
 
     A picture is empty if no cell of the component faces the way that the defect's cells do on average.
     """
-    chart = chart_of_cells(surface)
-    component = surface.charts.component[chart]
     pictures = []
     for centre, cells, field, number in defects:
+        surface = field.surface
         outward = surface.outward[cells].mean(axis=0)
-        facing = (component == number) & (surface.outward @ outward > SAME_SIDE_COS) & (surface.share > LEAST_SHARE)
+        same_side = (surface.component == number) & (surface.outward @ outward > SAME_SIDE_COS)
         # Along the cells of the defect's face: a rotated grid would have gaps.
-        along = surface.charts.axes[chart[cells[len(cells) // 2]], 0]
-        shown = np.flatnonzero(facing)
-        pictures.append(_picture(centre, cells, shown, along, outward, field, surface) if len(shown) else Picture())
+        along = surface.charts.axes[surface.chart[cells[len(cells) // 2]], 0]
+        shown = np.flatnonzero(same_side & (surface.share > LEAST_SHARE))
+        pictures.append(_picture(centre, cells, shown, along, outward, field) if len(shown) else Picture())
     return tuple(pictures)
 
 
-def _picture(
-    centre: Floats, cells: Ints, facing: Ints, along: Floats, outward: Floats, field: Field, surface: DesignSurface
-) -> Picture:
+def _picture(centre: Floats, cells: Ints, facing: Ints, along: Floats, outward: Floats, field: Field) -> Picture:
+    surface = field.surface
     axes = np.stack([along, np.cross(outward / np.linalg.norm(outward), along)])
     extent = (surface.centres[cells] - centre) @ axes.T
     low, high = extent.min(axis=0), extent.max(axis=0)

@@ -33,17 +33,6 @@ class DesignPose:
     doubt: Reason | None = None
 
 
-@dataclass(frozen=True)
-class Measured:
-    """What step deviation states of the pose of one part."""
-
-    status: Status
-    reasons: tuple[Reason, ...]
-    T_design_scan: Floats
-    registration: Registration
-    registration_error: float
-
-
 def pose(scene: Scene, earlier: dict[str, Any], params: Params) -> DesignPose:
     """Return the pose of step deviation where it ran, else a pose by the same rule.
 

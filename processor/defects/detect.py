@@ -84,10 +84,11 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
             search = moved_bodies.together(movements, _search(scene, again, pose.error_mm, params))
             registered = again
     result = to_result.result_of(search, params, origin, pose.doubt)
-    T = alignment.corrected_pose(registered.T_design_project, search.alignment)
+    aligned = search.field.alignment
+    T = alignment.corrected_pose(registered.T_design_project, aligned)
     return dataclasses.replace(
         result,
-        covariance=rigid.about_origin(search.alignment.pose_covariance(), search.alignment.centre + origin),
+        covariance=rigid.about_origin(aligned.pose_covariance(), aligned.centre + origin),
         status=pose.status if result.status is Status.OK else result.status,
         reasons=(
             *pose.reasons,
@@ -112,7 +113,7 @@ def _of_names(bodies: DesignBodies | None) -> Iterator[Reason]:
 
 def _of_views(search: to_result.Search) -> Iterator[Reason]:
     """Yield what is taken of the errors of views that are not named, and of those that all views share."""
-    if search.points.observed.stations.unnamed and search.alignment.fitted:
+    if search.points.observed.stations.unnamed and search.field.alignment.fitted:
         yield reason(
             "defects.views-by-class",
             shift=scanner_class_errors.SHIFT_SD_MM,
@@ -169,36 +170,34 @@ def _search(scene: Scene, registered: Registered, error_mm: float, params: Param
     """Search for shapes of components, places that deviate and places that are missing."""
     surface, observed, pairs = registered.surface, registered.observed, registered.pairs
     alarms_per_mm2 = params.false_alarms / (1e6 * params.per_m2)
-    aligned, field, shapes = _fitted_shapes(registered, error_mm, params)
+    field, shapes = _fitted_shapes(registered, error_mm, params)
     candidates = {fit.component: [s for s in fit.fitted.shapes if s.kind != "bump"] for fit in shapes}
     residuals = field.minus(component_deviations.values(surface, shapes, candidates))
-    levels = scan_statistic.levels_of(residuals, surface, alarms_per_mm2, params.systematic_mm)
-    significant = component_deviations.significant(shapes, surface, field, aligned, levels, alarms_per_mm2)
+    levels = scan_statistic.levels_of(residuals, alarms_per_mm2, params.systematic_mm)
+    significant = component_deviations.significant(shapes, field, levels, alarms_per_mm2)
     chosen = {number: [judged.shape for judged in of_one] for number, of_one in significant.items()}
     shape_values = component_deviations.values(surface, shapes, chosen)
     shape_values += component_deviations.values(
         surface, shapes, component_deviations.unproven_motions(shapes, significant)
     )
-    if not aligned.fitted:
-        shape_values += face_offsets.unproven(field.minus(shape_values), surface)
+    if not field.alignment.fitted:
+        shape_values += face_offsets.unproven(field.minus(shape_values))
     residuals = field.minus(shape_values).without(component_deviations.jumps(surface, shapes, chosen))
     searched = scan_statistic.widened(residuals, levels)
-    finding = scan_statistic.search(searched, surface, levels)
+    finding = scan_statistic.search(searched, levels)
     expected = expected_points.expected(pairs, surface, observed.stations)
-    missing = shaded = regions.missing(field, expected.points, surface, alarms_per_mm2)
+    missing = shaded = regions.missing(field, expected.points, alarms_per_mm2)
     if missing:
         expected = expected_points.without_shade(expected, [one.cells for one in missing], surface, observed.stations)
-        missing = regions.missing(field, expected.points, surface, alarms_per_mm2)
+        missing = regions.missing(field, expected.points, alarms_per_mm2)
     hidden = regions.hidden(expected.hidden | (observed.beside > 0), shaded, missing, field)
     missing += _inferred(scene, registered, field, missing, alarms_per_mm2)
     deviating = regions.of_finding(finding, surface)
     near_mm = max(UNITE_CELLS * surface.charts.cell_mm, UNITE_MM)
     united = regions.united(missing + deviating, surface, near_mm)
     return to_result.Search(
-        surface=surface,
         field=field,
         residuals=residuals,
-        alignment=aligned,
         levels=levels,
         shapes=shapes,
         significant=significant,
@@ -206,7 +205,7 @@ def _search(scene: Scene, registered: Registered, error_mm: float, params: Param
         expected=expected.points,
         hidden=hidden,
         shape_values=shape_values,
-        points=measures.points_by_cell(observed, surface, aligned),
+        points=measures.points_by_cell(observed, field),
     )
 
 
@@ -217,55 +216,39 @@ def _inferred(
 
     Rays show nothing where stations are not named, or see a face obliquely alone. ``missing`` is what they show.
     """
-    surface = registered.surface
     gone: list[Region] = []
     if registered.observed.stations.unnamed:
-        gone = missing_bodies.of_bodies(registered.observed, field, surface, surface.hidden, alarms_per_mm2)
-    points = _sample(scene, registered.T_design_project)
+        gone = missing_bodies.of_bodies(registered.observed, field, alarms_per_mm2)
     known = {cell for region in missing + gone for cell in region.cells.tolist()}
-    cut = holes.holes(field, surface, points, alarms_per_mm2)
+    step = max(1, sum(len(scan.points) for scan in scene.scans) // SD_SAMPLES)
+    T = registered.T_design_project
+    few = [rigid.apply(T @ scan.pose, every(scan.points, step) + scan.origin) for scan in scene.scans]
+    cut = holes.holes(field, np.concatenate(few), alarms_per_mm2)
     return gone + [region for region in cut if known.isdisjoint(region.cells.tolist())]
 
 
-def _sample(scene: Scene, T_design_project: Floats) -> Floats:
-    """Return points (n, 3) of all scans in the design's frame, at most about SD_SAMPLES of them."""
-    step = max(1, sum(len(scan.points) for scan in scene.scans) // SD_SAMPLES)
-    return np.concatenate(
-        [rigid.apply(T_design_project @ scan.pose, every(scan.points, step) + scan.origin) for scan in scene.scans]
-    )
-
-
-def _fitted_shapes(
-    registered: Registered, error_mm: float, params: Params
-) -> tuple[Alignment, Field, list[ComponentShape]]:
+def _fitted_shapes(registered: Registered, error_mm: float, params: Params) -> tuple[Field, list[ComponentShape]]:
     """Fit shapes of components; align the whole again without the components that have one, if that is more precise."""
     surface, pairs, stations = registered.surface, registered.pairs, registered.observed.stations
+    inner = deviation_field.inner_cells(surface, params.edge_mm)
 
-    def fitted(aligned: Alignment) -> tuple[Alignment, Field, list[ComponentShape]]:
-        return (aligned, *_shapes_of(registered, aligned, params))
+    def fitted(aligned: Alignment) -> tuple[Field, list[ComponentShape]]:
+        field = deviation_field.of_pairs(pairs, surface, stations, aligned, inner)
+        if aligned.fitted:
+            bias = deviation_field.common_bias(field)
+            field = dataclasses.replace(field, deviation=field.deviation - bias, bias=bias)
+        return field, component_deviations.fit_all(field)
 
-    first = fitted(registered.alignment)
-    deformed = component_deviations.deformed(first[2])
-    if not (first[0].fitted and deformed):
-        return first
+    def median_sd(aligned: Alignment) -> float:
+        """Return the median over the surface of the standard deviation that the fit of the whole leaves, mm."""
+        rows = slice(None, None, max(1, len(surface.centres) // SD_SAMPLES))
+        return float(np.median(aligned.sd(surface.centres[rows], surface.outward[rows])))
+
+    field, shapes = fitted(registered.alignment)
+    deformed = component_deviations.deformed(shapes)
+    if not (field.alignment.fitted and deformed):
+        return field, shapes
     again = alignment.align(pairs, surface, stations, error_mm, deformed)
     # The components left may be few, or all on one side: then the whole is known better by all.
-    better = again.fitted and _median_sd(again, surface) < _median_sd(first[0], surface)
-    return fitted(again) if better else first
-
-
-def _shapes_of(registered: Registered, aligned: Alignment, params: Params) -> tuple[Field, list[ComponentShape]]:
-    """Return the field of an alignment, and the shapes of components in it."""
-    surface = registered.surface
-    inner = deviation_field.inner_cells(surface, params.edge_mm)
-    field = deviation_field.of_pairs(registered.pairs, surface, registered.observed.stations, aligned, inner)
-    if aligned.fitted:
-        bias = deviation_field.common_bias(field, surface)
-        field = dataclasses.replace(field, deviation=field.deviation - bias, bias=bias)
-    return field, component_deviations.fit_all(field, surface)
-
-
-def _median_sd(aligned: Alignment, surface: DesignSurface) -> float:
-    """Return the median over the surface of the standard deviation that the fit of the whole leaves, mm."""
-    rows = slice(None, None, max(1, len(surface.centres) // SD_SAMPLES))
-    return float(np.median(aligned.sd(surface.centres[rows], surface.outward[rows])))
+    better = again.fitted and median_sd(again) < median_sd(field.alignment)
+    return fitted(again) if better else (field, shapes)

@@ -12,8 +12,8 @@ from processor import tiles
 from processor.adjustment import moderated_variances, scanner_class_errors, view_error_from_opposite_sides
 from processor.defects.alignment import PAIRS_AT_ONCE, Alignment, rays_to, station_variance
 from processor.defects.observations import FEWEST_POINTS, Pairs
-from processor.defects.surface_charts import CYLINDER, PER_SIDE, Charts, DesignSurface, chart_of_cells
-from processor.model import NORMAL_95, Bools, Floats, Ints
+from processor.defects.surface_charts import CYLINDER, PER_SIDE, Charts, DesignSurface
+from processor.model import NORMAL_95, Floats, Ints
 from processor.robust_statistics import robust_sd_about_median
 from processor.views import Views
 
@@ -28,7 +28,7 @@ PIECE_CELLS = 6.0  # side of a piece of a face, whose mean is compared with that
 
 @dataclass(frozen=True)
 class Field:
-    """Deviation (mm, outward positive) of each cell (cells,), its variance from noise, and numbers of points.
+    """Deviation (mm, outward positive) of each cell (cells,) of a surface after an alignment, and its variance.
 
     ``stray`` counts points that do not agree with the others of the cell, or whose beams may have hit something else.
     ``inner`` are cells away from their face's border, ``seen`` those of them with enough points, and about them as
@@ -41,6 +41,8 @@ class Field:
     it has been taken off the deviations.
     """
 
+    surface: DesignSurface
+    alignment: Alignment
     deviation: Floats
     variance: Floats
     count: Ints
@@ -104,6 +106,8 @@ def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Views, alignment: A
     )
     of_stations = station_variance(pairs, surface, stations, alignment)
     return Field(
+        surface=surface,
+        alignment=alignment,
         deviation=mean,
         variance=variance,
         count=count.astype(np.int64),
@@ -119,17 +123,17 @@ def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Views, alignment: A
     )
 
 
-def common_bias(field: Field, surface: DesignSurface) -> float:
+def common_bias(field: Field) -> float:
     """Return what all components lie outward of the design by, mm, as by a bias that all surfaces have.
 
     0 where they do not agree on it, where it is more than the scanners of the class explain, or where most of what was
     seen faces one way: there it is a movement.
     """
-    seen = np.flatnonzero(field.seen * field.count)
+    surface, seen = field.surface, np.flatnonzero(field.seen * field.count)
     weight = surface.share[seen]
     if np.linalg.norm(weight @ surface.outward[seen]) > ONE_WAY * weight.sum():
         return 0.0
-    component = component_of_cells(surface)[seen]
+    component = surface.component[seen]
     bodies = [number for number in np.unique(component) if (component == number).sum() >= BODY_CELLS]
     level = np.array([np.median(field.deviation[seen[component == number]]) for number in bodies])
     if len(level) < FEWEST_BODIES:
@@ -145,7 +149,7 @@ def _noise(pairs: Pairs, surface: DesignSurface, count: Floats) -> tuple[Floats,
     cell of it, the noise of the face's points is not that of the cell's. Each station has a variance on each face. What
     the scatter about a cell differs from these is a factor on them.
     """
-    charts, of_cell = surface.charts, chart_of_cells(surface)
+    charts, of_cell = surface.charts, surface.chart
     chart = of_cell[pairs.cell]
     stations = int(pairs.station.max(initial=0)) + 1
     free = np.maximum(pairs.count - 1, 0).astype(np.float64)
@@ -179,12 +183,6 @@ def _noise(pairs: Pairs, surface: DesignSurface, count: Floats) -> tuple[Floats,
     return noise, total**2 / np.maximum(spread, 1e-12)
 
 
-def component_of_cells(surface: DesignSurface) -> Ints:
-    """Return the component (cells,) of each cell."""
-    component: Ints = surface.charts.component[chart_of_cells(surface)]
-    return component
-
-
 def _pooled(image: Floats, charts: Charts, chart: int, side: int = POOLED_CELLS) -> Floats:
     """Return the means of an image over squares of ``side`` cells."""
     mode = ("constant", "wrap" if charts.kind[chart] == CYLINDER else "constant")
@@ -193,30 +191,23 @@ def _pooled(image: Floats, charts: Charts, chart: int, side: int = POOLED_CELLS)
 
 
 def inner_cells(surface: DesignSurface, edge_mm: float) -> Floats:
-    """Return 1 for cells (cells,) away from where their face can no longer be seen, and 0 for others."""
-    inner, exposed = np.zeros(len(surface.share)), surface.covered & ~surface.hidden
-    for chart in range(len(surface.charts.kind)):
-        rows = surface.charts.cells(chart)
-        inner[rows] = _inner(exposed[rows], surface.charts, chart, edge_mm)
-    return inner
+    """Return 1 for cells (cells,) of which all samples lie ``edge_mm`` or more from where their face is no longer seen.
 
-
-def _inner(exposed: Bools, charts: Charts, chart: int, edge_mm: float) -> Floats:
-    """Mark cells (n,) of a chart of which all that can be seen lies ``edge_mm`` or more from where their face ends.
-
-    ``exposed`` (n, samples) are the samples on the face that no other body touches: beams at a contact hit both bodies.
+    It ends where another body touches it, too: beams at a contact hit both bodies. Other cells have 0.
     """
-    rows, columns = charts.shape[chart]
-    sample = charts.cell_mm / PER_SIDE
-    whole = exposed.reshape(rows, columns, PER_SIDE, PER_SIDE).transpose(0, 2, 1, 3)
-    whole = np.pad(whole.reshape(rows * PER_SIDE, columns * PER_SIDE), 1)
-    if charts.kind[chart] == CYLINDER:  # no border at the seam
-        whole[:, 0], whole[:, -1] = whole[:, -2], whole[:, 1]
-        whole = np.concatenate([whole, whole, whole], axis=1)
-    distance = ndimage.distance_transform_edt(whole, sampling=sample) - 0.5 * sample
-    if charts.kind[chart] == CYLINDER:
-        wide = columns * PER_SIDE + 2
-        distance = distance[:, wide : 2 * wide]
-    clear = (distance[1:-1, 1:-1] >= edge_mm).reshape(rows, PER_SIDE, columns, PER_SIDE)
-    inner: Floats = clear.all(axis=(1, 3)).ravel().astype(float)
+    charts, exposed = surface.charts, surface.covered & ~surface.hidden
+    inner, sample = np.zeros(len(surface.share)), charts.cell_mm / PER_SIDE
+    for chart, (rows, columns) in enumerate(charts.shape):
+        whole = exposed[charts.cells(chart)].reshape(rows, columns, PER_SIDE, PER_SIDE).transpose(0, 2, 1, 3)
+        whole = np.pad(whole.reshape(rows * PER_SIDE, columns * PER_SIDE), 1)
+        closed = charts.kind[chart] == CYLINDER  # no border at the seam
+        if closed:
+            whole[:, 0], whole[:, -1] = whole[:, -2], whole[:, 1]
+            whole = np.concatenate([whole, whole, whole], axis=1)
+        distance = ndimage.distance_transform_edt(whole, sampling=sample) - 0.5 * sample
+        if closed:
+            wide = columns * PER_SIDE + 2
+            distance = distance[:, wide : 2 * wide]
+        clear = (distance[1:-1, 1:-1] >= edge_mm).reshape(rows, PER_SIDE, columns, PER_SIDE)
+        inner[charts.cells(chart)] = clear.all(axis=(1, 3)).ravel()
     return inner

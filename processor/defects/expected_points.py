@@ -15,7 +15,7 @@ import numpy as np
 from scipy import ndimage
 
 from processor.defects.observations import CHUNK, Pairs, cells_at
-from processor.defects.surface_charts import GRID_SHARE, DesignSurface, chart_of_cells
+from processor.defects.surface_charts import GRID_SHARE, DesignSurface
 from processor.geometry import mesh_distance
 from processor.geometry.mesh_distance import FacetGrid
 from processor.model import Bools, Floats, Ints
@@ -94,7 +94,7 @@ def without_shade(of: Expected, places: list[Ints], surface: DesignSurface, stat
     Shade of what stands close to a face and is not of the design, as of a stack beside a column, is found so to the
     ray, where directions in bins would leave a strip of it.
     """
-    charts, touched = surface.charts, np.unique(chart_of_cells(surface)[np.concatenate(places)])
+    charts, touched = surface.charts, np.unique(surface.chart[np.concatenate(places)])
     facets = np.flatnonzero(np.isin(surface.chart_of, touched))
     grid, parts = _grid_of(surface, facets), []
     for k, cell, number in of.of_stations:
@@ -123,7 +123,7 @@ def without_shade(of: Expected, places: list[Ints], surface: DesignSurface, stat
 def _through(counted: Ints, surface: DesignSurface, stations: Views) -> Floats:
     """Return the number (cells,) of points measured through cells of faces that hardly any point lies on."""
     through = np.zeros(len(surface.share))
-    chart, charts = chart_of_cells(surface), len(surface.charts.kind)
+    chart, charts = surface.chart, len(surface.charts.kind)
     share = np.bincount(chart, (counted > 0) & (surface.share > 0.5), charts)
     unseen = share < FACE_SHARE * np.maximum(np.bincount(chart, surface.share > 0.5, charts), 1)
     facets = np.flatnonzero(unseen[surface.chart_of])
@@ -187,7 +187,7 @@ def _of_station(station: int, stations: Views, count: Floats, surface: DesignSur
 
     Also returns the cells (m,) that one hides. ``count`` (cells,) are the points that the station has on each cell.
     """
-    chart, charts = chart_of_cells(surface), len(surface.charts.kind)
+    chart, charts = surface.chart, len(surface.charts.kind)
     whole = np.bincount(chart, surface.share > 0.5, charts)
     faces = np.bincount(chart, count > 0, charts) >= FACE_SHARE * np.maximum(whole, 1)
     cell = np.flatnonzero(faces[chart] & (surface.share > 0.05))

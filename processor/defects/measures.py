@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
 from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
-from processor.defects.alignment import Alignment, rays_to
+from processor.defects.alignment import rays_to
 from processor.defects.deviation_field import Field
 from processor.defects.observations import Observed, cells_of, sorted_by_cell
 from processor.defects.places.profiles import PlaceCells
@@ -37,7 +38,7 @@ ROBUST_SDS = 2.0  # of a point, from which on its weight decreases
 
 @dataclass(frozen=True)
 class Measures:
-    """Measures of a region, mm; see :class:`processor.defects.result.Defects`.
+    """Measures of a region, mm: columns of :class:`processor.defects.result.Defects`, and two that decide its class.
 
     ``borders`` is the number of sides of its face that the region reaches.
     """
@@ -45,42 +46,35 @@ class Measures:
     centre: Floats
     axes: Floats
     extent: Floats
-    area: float
-    depth: float
+    area_mm2: float
+    depth_max: float
     depth_ci95: float
-    mean: float
-    volume: float
+    depth_mean: float
+    volume_mm3: float
     volume_ci95: float
-    edge: float
-    curvature: float
+    edge_distance: float
+    curvature_per_m: float
     lod95: float
     diameter: float
     borders: int
 
-
-@dataclass(frozen=True)
-class Depth:
-    """Depth at the deepest place (inward positive, mm), its sd, the larger curvature (1/m), the sd of a mean there."""
-
-    depth: float
-    sd: float
-    curvature: float
-    mean_sd: float
+    def columns(self) -> dict[str, Any]:
+        """Return the columns of a defect's row."""
+        return {name: value for name, value in vars(self).items() if name not in ("diameter", "borders")}
 
 
 @dataclass(frozen=True)
 class CellPoints:
-    """The points of a scene sorted by cell: ``order`` (n,) are their rows, ``cell`` (n,) their cells."""
+    """The points of a scene sorted by cell of a field: ``order`` (n,) are their rows, ``cell`` (n,) their cells."""
 
     observed: Observed
-    surface: DesignSurface
-    alignment: Alignment
+    field: Field
     order: Ints
     cell: Ints
 
     def about(self, region: Region, shape_values: Floats) -> tuple[Floats, Floats]:
         """Return places u, v (n, 2) about a region and deviations (n,), corrected and less shapes (cells,), mm."""
-        charts, chart = self.surface.charts, region.chart
+        surface, charts, chart = self.field.surface, self.field.surface.charts, region.chart
         wide = charts.shape[chart, 1]
         i, j = np.divmod(region.cells - charts.first[chart], wide)
         rows = np.arange(max(0, i.min() - MARGIN_CELLS), min(charts.shape[chart, 0], i.max() + MARGIN_CELLS + 1))
@@ -89,16 +83,16 @@ class CellPoints:
         first, last = np.searchsorted(self.cell, start), np.searchsorted(self.cell, stop)
         index = np.concatenate([[], *(np.arange(a, b) for a, b in zip(first, last, strict=True))]).astype(np.int64)
         points, cell = self.order[index], self.cell[index]
-        centres, outward = self.surface.centres[cell], self.surface.outward[cell]
+        centres, outward = surface.centres[cell], surface.outward[cell]
         station = self.observed.station[points].astype(np.int64)
         rays = rays_to(centres, self.observed.stations.positions[station])
-        correction = self.alignment.corrections(centres, outward, rays, station)
+        correction = self.field.alignment.corrections(centres, outward, rays, station)
         return self.observed.uv[points], self.observed.deviation[points] - correction - shape_values[cell]
 
 
-def points_by_cell(observed: Observed, surface: DesignSurface, alignment: Alignment) -> CellPoints:
+def points_by_cell(observed: Observed, field: Field) -> CellPoints:
     """Sort the points of a scene by their cells."""
-    count = np.zeros(len(surface.share), np.int64)
+    surface, count = field.surface, np.zeros(len(field.deviation), np.int64)
 
     def of_rows(rows: slice) -> tuple[Array, ...]:
         pure = np.flatnonzero(~observed.mixed[rows])
@@ -111,14 +105,12 @@ def points_by_cell(observed: Observed, surface: DesignSurface, alignment: Alignm
         by_cell = np.argsort(cell[part], kind="stable")
         order[part], cell[part] = order[part][by_cell], cell[part][by_cell]
         release()
-    return CellPoints(observed, surface, alignment, order, cell)
+    return CellPoints(observed, field, order, cell)
 
 
-def measure(
-    region: Region, field: Field, surface: DesignSurface, alignment: Alignment, inflation: float, thickness: float
-) -> Measures:
+def measure(region: Region, field: Field, inflation: float, thickness: float) -> Measures:
     """Measure a region on its face; the depth of a missing region is the ``thickness`` of the plate in mm."""
-    cell = surface.charts.cell_mm
+    surface, cell = field.surface, field.surface.charts.cell_mm
     uv, rows = unrolled(surface, region), region.cells
     area = surface.share[rows] * cell**2
     total = float(area.sum())
@@ -134,49 +126,49 @@ def measure(
     along = surface.charts.axes[region.chart, 0]
     across = np.cross(outward, along)
     longest = turn[0, 1] * along + turn[1, 1] * across
-    registration = registration_sd(alignment, field, place, outward, rows)
+    registration = registration_sd(field, place, outward, rows)
     edge, borders = _borders(region, surface, middle)
-    volume, volume_sd, summed = _volume(region, field, surface)
+    volume, volume_sd, summed = _volume(region, field)
     if region.sign == 0:
         # Missing: the uncertainty of the volume is that of the border's cells, which are missing in part.
         mean_sd = inflation / np.sqrt(np.sum(1.0 / np.maximum(variance, 1e-12)))
         border = cell * np.sqrt(np.pi * total)
-        depth = Depth(depth=thickness, sd=0.0, curvature=float("nan"), mean_sd=mean_sd)
-        depth_ci95, mean, volume, volume_ci95 = 0.0, thickness, total * thickness, NORMAL_95 * border * thickness
+        depth, curvature, depth_ci95, mean = thickness, float("nan"), 0.0, thickness
+        volume, volume_ci95 = total * thickness, NORMAL_95 * border * thickness
     else:
-        depth = _deepest(region, field, surface, inflation)
-        depth_ci95 = NORMAL_95 * float(np.hypot(depth.sd, registration))
+        depth, sd, curvature, mean_sd = _deepest(region, field, inflation)
+        depth_ci95 = NORMAL_95 * float(np.hypot(sd, registration))
         mean = -float((deviation * area).sum() / total)
         volume_ci95 = NORMAL_95 * float(np.hypot(volume_sd * inflation, registration * summed))
     return Measures(
         centre=place + (middle - uv[closest]) @ np.stack([along, across]),
         axes=np.stack([longest, np.cross(outward, longest), outward]),
         extent=extent,
-        area=total,
-        depth=depth.depth,
+        area_mm2=total,
+        depth_max=depth,
         depth_ci95=depth_ci95,
-        mean=mean,
-        volume=volume,
+        depth_mean=mean,
+        volume_mm3=volume,
         volume_ci95=volume_ci95,
-        edge=edge,
-        curvature=depth.curvature,
-        lod95=NORMAL_95 * float(np.hypot(depth.mean_sd, registration)),
+        edge_distance=edge,
+        curvature_per_m=curvature,
+        lod95=NORMAL_95 * float(np.hypot(mean_sd, registration)),
         diameter=float(2.0 * np.sqrt(total / np.pi)),
         borders=borders,
     )
 
 
-def registration_sd(alignment: Alignment, field: Field, place: Floats, outward: Floats, cells: Ints) -> float:
+def registration_sd(field: Field, place: Floats, outward: Floats, cells: Ints) -> float:
     """Return the standard deviation that all ``cells`` about a place (3,) have in common, mm: of poses and of views."""
-    return float(np.hypot(alignment.sd(place[None], outward[None])[0], field.stations_sd(cells)))
+    return float(np.hypot(field.alignment.sd(place[None], outward[None])[0], field.stations_sd(cells)))
 
 
-def cells_about(region: Region, field: Field, surface: DesignSurface, claimed: Bools) -> PlaceCells | None:
+def cells_about(region: Region, field: Field, claimed: Bools) -> PlaceCells | None:
     """Return the cells about a region that are seen and of no other place; None where it is small or on a cylinder.
 
     ``claimed`` (cells,) marks the cells of all places.
     """
-    charts, chart = surface.charts, region.chart
+    surface, charts, chart = field.surface, field.surface.charts, region.chart
     if charts.kind[chart] == CYLINDER or len(region.cells) < FEWEST_PROFILE:
         return None
     shape, first = charts.shape[chart], int(charts.first[chart])
@@ -201,33 +193,36 @@ def cells_about(region: Region, field: Field, surface: DesignSurface, claimed: B
     )
 
 
-def _volume(region: Region, field: Field, surface: DesignSurface) -> tuple[float, float, float]:
+def _volume(region: Region, field: Field) -> tuple[float, float, float]:
     """Return the volume inward, its standard deviation from noise, and the area, with a border about the region.
 
     Cells of the border are too shallow to be significant one by one, but add up.
     """
-    charts, chart = surface.charts, region.chart
+    charts, chart = field.surface.charts, region.chart
     mask = np.zeros(int(charts.shape[chart].prod()), bool)
     mask[region.cells - charts.first[chart]] = True
     wide = max(1, round(VOLUME_BORDER * float(np.sqrt(len(region.cells) / np.pi))))
     grown = ndimage.distance_transform_edt(~mask.reshape(tuple(charts.shape[chart]))) <= wide
     rows = charts.first[chart] + np.flatnonzero(grown.ravel())
     rows = rows[(field.seen[rows] > 0) | mask[rows - charts.first[chart]]]
-    area = surface.share[rows] * charts.cell_mm**2
+    area = field.surface.share[rows] * charts.cell_mm**2
     sd = float(np.sqrt((field.variance[rows] * area**2).sum()))
     return -float(field.deviation[rows] @ area), sd, float(area.sum())
 
 
-def _deepest(region: Region, field: Field, surface: DesignSurface, inflation: float) -> Depth:
-    """Return the depth at the deepest place: the vertex of a paraboloid fitted about it, or else the mean there."""
-    uv, cell = unrolled(surface, region), surface.charts.cell_mm
+def _deepest(region: Region, field: Field, inflation: float) -> tuple[float, float, float, float]:
+    """Return the depth at the deepest place (inward positive, mm), its sd, curvature (1/m), and the sd of a mean there.
+
+    The depth is that of the vertex of a paraboloid fitted about the place, or else the mean there.
+    """
+    uv, cell = unrolled(field.surface, region), field.surface.charts.cell_mm
     deviation, variance = field.deviation[region.cells], field.variance[region.cells]
     seen = field.seen[region.cells] > 0
     if seen.sum() < FEWEST_CELLS:
         used = seen if seen.any() else np.ones(len(deviation), bool)
         k = int(np.argmax(np.where(used, region.sign * deviation / np.sqrt(variance), -np.inf)))
         sd = float(np.sqrt(variance[k])) * inflation
-        return Depth(depth=-float(deviation[k]), sd=sd, curvature=float("nan"), mean_sd=sd)
+        return -float(deviation[k]), sd, float("nan"), sd
     radius = max(np.sqrt(len(deviation) / np.pi), 1.0) * cell
     tree = cKDTree(uv[seen])
     value, weight, at = deviation[seen], 1.0 / variance[seen], uv[seen]
@@ -243,7 +238,7 @@ def _deepest(region: Region, field: Field, surface: DesignSurface, inflation: fl
     curvature = _curvature(at, value, weight, tree.query_ball_point(at[k], CURVE_SHARE * radius), at[k])
     if not abs(top - mean) < max(0.3 * abs(mean), 4.0 * sd) or sd > abs(mean):
         top, sd = mean, mean_sd
-    return Depth(depth=-top, sd=sd, curvature=curvature, mean_sd=mean_sd)
+    return -top, sd, curvature, mean_sd
 
 
 def _vertex(at: Floats, value: Floats, weight: Floats, sign: int, side: float) -> tuple[float, float]:
@@ -298,10 +293,8 @@ def _borders(region: Region, surface: DesignSurface, middle: Floats) -> tuple[fl
     return edge, int(sum(sides))
 
 
-def thickness_at(
-    surface: DesignSurface, point: Floats, outward: Floats, component: int, most: float = DEEPEST_MM
-) -> float:
-    """Return the thickness of the design behind a place (3,), mm; NaN if there is no face within ``most``.
+def thickness_at(surface: DesignSurface, point: Floats, outward: Floats, component: int) -> float:
+    """Return the thickness of the design behind a place (3,), mm; NaN if there is no face within DEEPEST_MM.
 
     Intersection of a ray with triangles after Moeller and Trumbore (1997).
     """
@@ -318,23 +311,21 @@ def thickness_at(
         v = (q @ ray) / determinant
         t = np.einsum("ni,ni->n", e2, q) / determinant
         inside = (u >= -1e-6) & (v >= -1e-6) & (u + v <= 1.0 + 1e-6)
-        hit = (np.abs(determinant) > 1e-9) & inside & (t > 0.5) & (t < most)
+        hit = (np.abs(determinant) > 1e-9) & inside & (t > 0.5) & (t < DEEPEST_MM)
     return float(t[hit].min()) if hit.any() else float("nan")
 
 
-def refined(
-    measured: Measures, region: Region, points: CellPoints, field: Field, shape_values: Floats, inflation: float
-) -> Measures:
+def refined(measured: Measures, region: Region, points: CellPoints, shape_values: Floats, inflation: float) -> Measures:
     """Return measures with depth and diameter of a bump d exp(-(r / R)^q) fitted to points; unchanged without a fit.
 
     For small dents and pits: cells average their depth, and those at the rim are not significant one by one. The
     exponent q covers round and flat bottoms.
     """
-    uv, deviation = points.about(region, shape_values)
-    middle = unrolled(points.surface, region).mean(axis=0)
-    radius = max(0.5 * measured.diameter, points.surface.charts.cell_mm)
+    field, (uv, deviation) = points.field, points.about(region, shape_values)
+    middle = unrolled(field.surface, region).mean(axis=0)
+    radius = max(0.5 * measured.diameter, field.surface.charts.cell_mm)
     noise = float(np.median(field.noise[region.cells]))
-    used = np.abs(deviation) < 3.0 * abs(measured.depth) + 6.0 * noise
+    used = np.abs(deviation) < 3.0 * abs(measured.depth_max) + 6.0 * noise
     uv, deviation = (uv[used] - middle) / radius, deviation[used]
     if len(deviation) < FEWEST_POINTS:
         return measured
@@ -345,7 +336,7 @@ def refined(
 
     fit = least_squares(
         lambda x: (deviation - bump(x)) / noise,
-        [0.0, 0.0, 0.8, measured.depth, 3.0],
+        [0.0, 0.0, 0.8, measured.depth_max, 3.0],
         bounds=([-1.5, -1.5, 0.2, -np.inf, EXPONENTS[0]], [1.5, 1.5, 3.0, np.inf, EXPONENTS[1]]),
         loss="soft_l1",
         f_scale=ROBUST_SDS,
@@ -356,11 +347,11 @@ def refined(
         return measured
     sd = float(np.sqrt(variance)) if variance > 0.0 else np.inf  # by rounding, of a matrix that is nearly singular
     depth = float(fit.x[3])
-    plausible = depth * measured.depth > 0.0 and abs(depth) <= 4.0 * abs(measured.depth)
+    plausible = depth * measured.depth_max > 0.0 and abs(depth) <= 4.0 * abs(measured.depth_max)
     if not (fit.success and plausible and sd < 0.5 * abs(depth)):
         return measured
     curvature = 2.0 * abs(depth) / (fit.x[2] * radius) ** 2 * 1000.0
-    registration = registration_sd(points.alignment, field, measured.centre, measured.axes[2], region.cells)
+    registration = registration_sd(field, measured.centre, measured.axes[2], region.cells)
     ci95 = NORMAL_95 * float(np.hypot(sd * inflation, registration))
     diameter = float(2.0 * fit.x[2] * radius * np.log(1.0 / RIM_SHARE) ** (1.0 / fit.x[4]))
-    return dataclasses.replace(measured, depth=depth, depth_ci95=ci95, curvature=curvature, diameter=diameter)
+    return dataclasses.replace(measured, depth_max=depth, depth_ci95=ci95, curvature_per_m=curvature, diameter=diameter)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -16,7 +15,7 @@ from numba import njit
 from processor import large_arrays
 from processor.adjustment import mixed_pixels
 from processor.adjustment.mixed_pixels import Block
-from processor.defects.surface_charts import CYLINDER, DesignSurface, chart_of_cells, gridded, layout, placed
+from processor.defects.surface_charts import CYLINDER, DesignSurface, gridded, layout, placed
 from processor.geometry import mesh_bodies, mesh_distance
 from processor.geometry.mesh_distance import FacetGrid, Samples
 from processor.large_arrays import Array, allocate, blocks, in_parts
@@ -83,49 +82,29 @@ def observe(scene: Scene, T_design_project: Floats, surface: DesignSurface, reac
     if not seen.count:
         raise InputError(f"{scene.name}: expected scans of the structure, found no points")
     grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, reach_mm)
-    found = _Found.of(seen.count)
-    for scan in range(len(scene.scans)):
-        found = _of_scan(seen, scan, surface, grid, found)
-    return Observed(
-        chart=found.chart[: found.filled],
-        uv=found.uv[: found.filled],
-        station=found.station[: found.filled],
-        deviation=found.deviation[: found.filled],
-        mixed=found.mixed[: found.filled],
+    room = Observed(
+        chart=allocate(seen.count, dtype=np.int32),
+        uv=allocate(seen.count, 2),
+        station=allocate(seen.count, dtype=np.int32),
+        deviation=allocate(seen.count),
+        mixed=allocate(seen.count, dtype=np.bool_),
         stations=seen,
-        points=len(found.chart),
+        points=seen.count,
     )
+    filled = 0
+    for scan in range(len(scene.scans)):
+        filled = _of_scan(scan, surface, grid, room, filled)
+    columns = ("chart", "uv", "station", "deviation", "mixed")
+    return replace(room, **{name: getattr(room, name)[:filled] for name in columns})
 
 
-class _Found(NamedTuple):
-    """Columns of :class:`Observed` with room for all points, of which some are ``filled``."""
-
-    chart: Labels
-    uv: Floats
-    station: Labels
-    deviation: Floats
-    mixed: Bools
-    filled: int
-
-    @classmethod
-    def of(cls, most: int) -> _Found:
-        """Allocate the columns."""
-        return cls(
-            chart=allocate(most, dtype=np.int32),
-            uv=allocate(most, 2),
-            station=allocate(most, dtype=np.int32),
-            deviation=allocate(most),
-            mixed=allocate(most, dtype=np.bool_),
-            filled=0,
-        )
-
-
-def _of_scan(seen: Views, scan: int, surface: DesignSurface, grid: FacetGrid, found: _Found) -> _Found:
-    """Add what is known of the points of a scan that are on faces."""
+def _of_scan(scan: int, surface: DesignSurface, grid: FacetGrid, found: Observed, filled: int) -> int:
+    """Write the points of a scan that are on faces after those ``filled``; return how many there are then."""
+    seen = found.stations
     known, scanners = np.isfinite(seen.positions.sum(axis=1)), np.nan_to_num(seen.positions)
     total = len(seen.scans[scan].points)
     nearest, used = allocate(total, dtype=np.int32), allocate(total, dtype=np.bool_)
-    count, any_known = found.filled, False
+    count, any_known = filled, False
     for rows, (points, station) in zip(blocks(total, CHUNK), seen.blocks(CHUNK, scan), strict=True):
         any_known = any_known or bool(known[station].any())
         facet, deviation = mesh_distance.nearest_visible(grid, points, scanners, np.where(known[station], station, -1))
@@ -146,11 +125,11 @@ def _of_scan(seen: Views, scan: int, surface: DesignSurface, grid: FacetGrid, fo
         used[rows.start + on] = True
         count = part.stop
     if any_known:
-        of_points = _Sights(seen, scan, surface, nearest, used=used, deviation=found.deviation[found.filled : count])
+        of_points = _Sights(seen, scan, surface, nearest, used=used, deviation=found.deviation[filled:count])
         beside = mixed_pixels.mark_passes(of_points, seen.positions, surface.normals)
         for rows in blocks(len(beside)):
-            found.mixed[found.filled : count][rows] |= beside[rows]
-    return found._replace(filled=count)
+            found.mixed[filled:count][rows] |= beside[rows]
+    return count
 
 
 @dataclass(frozen=True)
@@ -188,7 +167,7 @@ def without_beside(observed: Observed, surface: DesignSurface) -> Observed:
     few = np.arange(0, len(observed.chart), step)
     few = few[~observed.mixed[few]]
     feet, normals = placed(net.charts, observed.chart[few], observed.uv[few])
-    of_cell, diameter = body[chart_of_cells(net)[on]], LAYER_CELLS * net.charts.cell_mm
+    of_cell, diameter = body[net.chart[on]], LAYER_CELLS * net.charts.cell_mm
     layers = surface_layers.of_points(core, of_cell, feet, observed.deviation[few], normals, diameter, PIECE_MM)
     mixed, beside = allocate(len(observed.chart), dtype=np.bool_), np.zeros(len(surface.share), np.int64)
     for rows in blocks(len(mixed)):

@@ -55,13 +55,13 @@ def of_finding(finding: Finding, surface: DesignSurface) -> list[Region]:
     return regions
 
 
-def missing(field: Field, expected: Floats, surface: DesignSurface, alarms_per_mm2: float) -> list[Region]:
+def missing(field: Field, expected: Floats, alarms_per_mm2: float) -> list[Region]:
     """Return connected cells with far fewer points than ``expected`` (cells,), at the given rate of false alarms.
 
     Of the points expected, COUNTED_SHARE are counted on; so many must be improbable to be missing by a Poisson
     distribution, on the cells that are not at the face's border.
     """
-    charts = surface.charts
+    charts = field.surface.charts
     count = field.count + field.stray
     inner = field.inner > 0.0  # cells that could be examined: beams there hit the face alone
     threshold = -np.log(alarms_per_mm2 * charts.cell_mm**2)

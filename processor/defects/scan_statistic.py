@@ -19,7 +19,7 @@ from scipy import ndimage
 from scipy.special import ndtr, ndtri, stdtrit
 
 from processor.defects.deviation_field import Field
-from processor.defects.surface_charts import CYLINDER, Charts, DesignSurface
+from processor.defects.surface_charts import CYLINDER
 from processor.model import Bools, Floats, Ints
 from processor.robust_statistics import robust_sd_about_median
 
@@ -67,17 +67,17 @@ class Finding:
     chance: Floats
 
 
-def levels_of(field: Field, surface: DesignSurface, alarms_per_mm2: float, systematic_mm: float) -> Levels:
+def levels_of(field: Field, alarms_per_mm2: float, systematic_mm: float) -> Levels:
     """Return the thresholds for a field, and by how much its noise exceeds that of independent points."""
-    charts = surface.charts
-    used = _used(field, charts)
+    charts = field.surface.charts
+    used = _used(field)
     sides = tuple(side for side in SIDES if any(side <= charts.shape[k].min() for k in used)) or (1,)
     scatter: list[tuple[float, float]] = []
     for side in sides:
-        z, sd = _windows(field, charts, used, side)
+        z, sd = _windows(field, used, side)
         scatter.append(_scatter(z, sd, field.views) if len(z) >= FEWEST_WINDOWS else (scatter or [(1.0, 0.0)])[-1])
     inflation, common = np.array(scatter, float).T
-    line_inflation, line_common = _line_scatter(field, charts, used)
+    line_inflation, line_common = _line_scatter(field, used)
     cell = charts.cell_mm
     kinds = len(sides) + len(LINE_CELLS)
     windows = kinds / np.array([max(1, side // 4) * cell for side in sides]) ** 2
@@ -96,17 +96,16 @@ def levels_of(field: Field, surface: DesignSurface, alarms_per_mm2: float, syste
     )
 
 
-def search(field: Field, surface: DesignSurface, levels: Levels) -> Finding:
+def search(field: Field, levels: Levels) -> Finding:
     """Search from small windows to large; cells of a region do not count in larger windows.
 
     ``field`` is that of :func:`widened`.
     """
-    charts = surface.charts
-    count = len(surface.share)
+    count = len(field.deviation)
     finding = Finding(np.zeros(count, np.int8), np.zeros(count), np.full(count, np.inf))
-    for chart in _used(field, charts):
-        rows = charts.cells(chart)
-        of_chart = _search_chart(field, charts, chart, levels)
+    for chart in _used(field):
+        rows = field.surface.charts.cells(chart)
+        of_chart = _search_chart(field, chart, levels)
         finding.sign[rows] = of_chart.sign.ravel()
         finding.z[rows] = of_chart.z.ravel()
         finding.chance[rows] = of_chart.chance.ravel()
@@ -133,16 +132,17 @@ def mean_sd(weight: Any, inflation: Any, common: Any, field: Field, levels: Leve
     return np.hypot(noise, np.hypot(levels.systematic_mm, field.views))
 
 
-def _used(field: Field, charts: Charts) -> list[int]:
+def _used(field: Field) -> list[int]:
     """Return the charts with observed cells."""
+    charts = field.surface.charts
     return [k for k in range(len(charts.kind)) if field.seen[charts.cells(k)].any()]
 
 
-def _windows(field: Field, charts: Charts, used: list[int], side: int) -> tuple[Floats, Floats]:
+def _windows(field: Field, used: list[int], side: int) -> tuple[Floats, Floats]:
     """Return the means of all windows of a size by their formal standard deviation, and that standard deviation."""
     z, sd = [np.empty(0)], [np.empty(0)]
     for chart in used:
-        top, weight = _window_sums(field, charts, chart, side, None)
+        top, weight = _window_sums(field, chart, side, None)
         z.append((top / np.sqrt(np.maximum(weight, 1e-30)))[weight > 0.0])
         sd.append(1.0 / np.sqrt(weight[weight > 0.0]))
     return np.concatenate(z), np.concatenate(sd)
@@ -158,9 +158,9 @@ def _scatter(z: Floats, sd: Floats, views_mm: float) -> tuple[float, float]:
     return float(np.sqrt(1.0 + surplus)), float(np.sqrt(surplus)) * typical
 
 
-def _search_chart(field: Field, charts: Charts, chart: int, levels: Levels) -> Finding:
+def _search_chart(field: Field, chart: int, levels: Levels) -> Finding:
     """Search a face; the arrays of the finding have its shape."""
-    shape = tuple(charts.shape[chart])
+    shape = tuple(field.surface.charts.shape[chart])
     finding = Finding(np.zeros(shape, np.int8), np.zeros(shape), np.full(shape, np.inf))
     sign = finding.sign
     for side, inflation, common, threshold, per_mm2 in zip(
@@ -168,14 +168,14 @@ def _search_chart(field: Field, charts: Charts, chart: int, levels: Levels) -> F
     ):
         if side > min(shape):
             break
-        top, weight = _window_sums(field, charts, chart, side, sign != 0)
+        top, weight = _window_sums(field, chart, side, sign != 0)
         with np.errstate(invalid="ignore", divide="ignore"):
             z = np.where(weight > 0.0, top / weight / mean_sd(weight, inflation, common, field, levels), 0.0)
         if side == LINES_AFTER:
-            _search_lines(field, charts, chart, levels, finding)
+            _search_lines(field, chart, levels, finding)
         if not (np.abs(z) > threshold).any():
             continue
-        small_top, small_weight = _smoothed(field, charts, chart, max(1, side // 2), sign != 0)
+        small_top, small_weight = _smoothed(field, chart, max(1, side // 2), sign != 0)
         with np.errstate(invalid="ignore", divide="ignore"):
             small_sd = np.hypot(inflation / np.sqrt(small_weight), field.views)
             local_z = np.where(small_weight > 0.0, small_top / small_weight / small_sd, 0.0)
@@ -194,9 +194,9 @@ def _search_chart(field: Field, charts: Charts, chart: int, levels: Levels) -> F
     return finding
 
 
-def _search_lines(field: Field, charts: Charts, chart: int, levels: Levels, finding: Finding) -> None:
+def _search_lines(field: Field, chart: int, levels: Levels, finding: Finding) -> None:
     """Search lines of cells in LINE_TURNS directions, for what is narrower than a window and long; add to a finding."""
-    top, weight = _images(field, charts, chart, finding.sign != 0)
+    top, weight = _images(field, chart, finding.sign != 0)
     score = top / np.sqrt(np.maximum(weight, 1e-30))
     margin = max(LINE_CELLS)
     padded = np.pad(np.stack([top, weight, weight > 0.0]), ((0, 0), (margin, margin), (margin, margin)))
@@ -235,11 +235,11 @@ def _long_runs(score: Floats, cells: Ints) -> Ints:
     return long
 
 
-def _line_scatter(field: Field, charts: Charts, used: list[int]) -> tuple[float, float]:
+def _line_scatter(field: Field, used: list[int]) -> tuple[float, float]:
     """Return by how much the means of lines along the grid scatter more than by independent noise; see _scatter."""
     scores, sds = [np.empty(0)], [np.empty(0)]
     for chart in used:
-        top, weight = _images(field, charts, chart, None)
+        top, weight = _images(field, chart, None)
         for axis in (0, 1):
             length = min(LINE_CELLS[-1], top.shape[axis])
             sum_top, sum_weight, number = (
@@ -296,18 +296,19 @@ def _pieces_with(cells: Bools, some: Bools) -> Bools:
     return pieces
 
 
-def _images(field: Field, charts: Charts, chart: int, without: Bools | None) -> tuple[Floats, Floats]:
+def _images(field: Field, chart: int, without: Bools | None) -> tuple[Floats, Floats]:
     """Return images of weighted deviations and of weights."""
+    charts = field.surface.charts
     weight = charts.image(field.seen / field.variance, chart)
     if without is not None:
         weight = np.where(without, 0.0, weight)
     return weight * charts.image(field.deviation, chart), weight
 
 
-def _window_sums(field: Field, charts: Charts, chart: int, side: int, without: Bools | None) -> tuple[Floats, Floats]:
+def _window_sums(field: Field, chart: int, side: int, without: Bools | None) -> tuple[Floats, Floats]:
     """Return sums of weighted deviations and of weights over a face's windows; 0 where too little was seen."""
     step = max(1, side // 4)
-    top, weight = _images(field, charts, chart, without)
+    top, weight = _images(field, chart, without)
     if min(top.shape) < side:
         return np.zeros(0), np.zeros(0)
     sums = [_sums(x, side)[::step, ::step] for x in (top, weight, (weight > 0.0).astype(float))]
@@ -321,10 +322,10 @@ def _sums(image: Floats, side: int) -> Floats:
     return sums
 
 
-def _smoothed(field: Field, charts: Charts, chart: int, side: int, without: Bools) -> tuple[Floats, Floats]:
+def _smoothed(field: Field, chart: int, side: int, without: Bools) -> tuple[Floats, Floats]:
     """Return sums of weighted deviations and of weights over the window about each cell."""
-    mode = ("constant", "wrap" if charts.kind[chart] == CYLINDER else "constant")
-    top, weight = (ndimage.uniform_filter(x, side, mode=mode) * side**2 for x in _images(field, charts, chart, without))
+    mode = ("constant", "wrap" if field.surface.charts.kind[chart] == CYLINDER else "constant")
+    top, weight = (ndimage.uniform_filter(x, side, mode=mode) * side**2 for x in _images(field, chart, without))
     return top, np.where(weight > 1e-9, weight, 0.0)
 
 

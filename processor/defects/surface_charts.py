@@ -99,13 +99,22 @@ class DesignSurface:
 
         Their sum over a face is the area of its facets, which samples of cells at the border give to about 1 %.
         """
-        cells = self.charts.shape.prod(axis=1)
-        chart = np.repeat(np.arange(len(cells)), cells)
         facets = 0.5 * mesh_distance.double_areas(self.vertices, self.faces)[1]
         share = np.where(self.share > 0.5, self.share, 0.0)
-        scale = np.bincount(self.chart_of, facets) / np.maximum(np.bincount(chart, share, len(cells)), 1e-9)
-        areas: Floats = share * scale[chart]
+        of_chart = np.bincount(self.chart, share, len(self.charts.kind))
+        areas: Floats = share * (np.bincount(self.chart_of, facets) / np.maximum(of_chart, 1e-9))[self.chart]
         return areas
+
+    @cached_property
+    def chart(self) -> Ints:
+        """The chart (cells,) of each cell."""
+        return np.repeat(np.arange(len(self.charts.kind)), self.charts.shape.prod(axis=1))
+
+    @property
+    def component(self) -> Ints:
+        """The component (cells,) of each cell."""
+        component: Ints = self.charts.component[self.chart]
+        return component
 
     @property
     def area_mm2(self) -> float:
@@ -157,7 +166,7 @@ def gridded(surface: DesignSurface, cell_mm: float) -> DesignSurface:
 def _hidden(surface: DesignSurface) -> Bools:
     """Mark the samples (cells, samples) of cells that another body of the design touches or holds."""
     charts, marked = surface.charts, np.zeros_like(surface.covered)
-    along = np.repeat(charts.axes[:, 0], charts.shape.prod(axis=1), axis=0)
+    along = charts.axes[surface.chart, 0]
     across = np.cross(surface.outward, along)
     body = mesh_bodies.closed_bodies(surface.faces)
     near = np.flatnonzero(_near_bodies(surface, body, 0.5 * charts.cell_mm * (np.abs(along) + np.abs(across))))
@@ -191,11 +200,6 @@ def layout(charts: Charts, chart: Ints, points: Floats) -> Floats:
     local = np.einsum("nij,nj->ni", charts.axes[chart], arm)
     around = charts.radius[chart] * np.arctan2(local[:, 1], local[:, 2])
     return np.stack([local[:, 0], np.where(charts.kind[chart] == CYLINDER, around, local[:, 1])], axis=1)
-
-
-def chart_of_cells(surface: DesignSurface) -> Ints:
-    """Return the chart (cells,) of each cell."""
-    return np.repeat(np.arange(len(surface.charts.kind)), surface.charts.shape.prod(axis=1))
 
 
 def with_components(vertices: Floats, faces: Ints, bodies: DesignBodies | None = None) -> tuple[MeshSurface, Ints]:

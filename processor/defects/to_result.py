@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from processor.defects import classification, defect_grids, measures, regions
-from processor.defects.alignment import Alignment
 from processor.defects.classification import Classification
 from processor.defects.component_deviations import (
     ComponentShape,
@@ -49,10 +48,8 @@ STEP_SHARE = 0.02  # of a step's height, above which a place belongs to it
 class Search:
     """State of the search: ``residuals`` are the deviations less the ``significant`` shapes of components."""
 
-    surface: DesignSurface
     field: Field
     residuals: Field
-    alignment: Alignment
     levels: Levels
     shapes: list[ComponentShape]
     significant: dict[int, list[SignificantShape]]
@@ -80,10 +77,9 @@ def result_of(search: Search, params: Params, origin: Floats, doubt: Reason | No
     """
     defects = [*_shape_defects(search), *_place_defects(search)]
     defects.sort(key=lambda defect: (-abs(defect.values["volume_mm3"]), defect.values["centre"].tolist()))
-    surface, field = search.surface, search.field
+    field, surface, cell = search.field, search.field.surface, search.field.surface.charts.cell_mm
     seen = field.seen > 0
-    cell = surface.charts.cell_mm
-    of_pose = search.alignment.sd(surface.centres[seen], surface.outward[seen])
+    of_pose = field.alignment.sd(surface.centres[seen], surface.outward[seen])
     registration = np.sqrt(of_pose**2 + field.stations[seen] + field.views**2)
     noise = finite_median(field.noise[seen])
     formal = np.sqrt(field.variance[seen]) * search.levels.inflation[0]
@@ -92,7 +88,7 @@ def result_of(search: Search, params: Params, origin: Floats, doubt: Reason | No
     hidden = float(surface.share[search.hidden].sum()) * cell**2
     if hidden > LEAST_HIDDEN * (examined + hidden):
         reasons.append(reason("defects.hidden", hidden=hidden / 1e6, share=100.0 * hidden / (examined + hidden)))
-    if not search.alignment.fitted:
+    if not field.alignment.fitted:
         reasons.append(reason("defects.not-fitted"))
     drawn = [(d.values["centre"], d.cells, d.field, d.component) for d in defects[: params.pictures]]
     return Result(
@@ -107,8 +103,8 @@ def result_of(search: Search, params: Params, origin: Floats, doubt: Reason | No
         expected_mm2=float(surface.share[search.expected > 0.0].sum()) * cell**2,
         least_depth=_least_depth(search.levels, cell, noise, finite_median(field.count[seen]), field),
         defects=table([defect.values for defect in defects], origin, doubt),
-        pictures=defect_grids.of_defects(drawn, surface),
-        surface=defect_grids.of_surface([defect.cells for defect in defects], field, surface, origin),
+        pictures=defect_grids.of_defects(drawn),
+        surface=defect_grids.of_surface([defect.cells for defect in defects], field, origin),
     )
 
 
@@ -152,13 +148,13 @@ def _row(classification: Classification, component: str, **values: Any) -> dict[
 
 def _shape_defects(search: Search) -> Iterator[Defect]:
     """Yield a defect for each significant shape of a component."""
-    surface = search.surface
+    surface = search.field.surface
     fits = {fit.component: fit for fit in search.shapes}
     for component, shapes in sorted(search.significant.items()):
         fit = fits[component]
-        front = cells_of_shape(surface, search.field, fit)
+        front = cells_of_shape(search.field, fit)
         for shape in _of_held_plate(search, front, shapes, fit.frame) if len(front) else ():
-            rows = cells_of_shape(surface, search.field, fit, shape.shape)
+            rows = cells_of_shape(search.field, fit, shape.shape)
             judged = shape
             if shape.shape.kind == RIGID:  # a movement has its largest value on the cells of a face or at its corners
                 value = shape.shape.values(fit.frame, *with_corners(surface, rows))
@@ -175,7 +171,7 @@ def _of_held_plate(search: Search, rows: Ints, shapes: list[SignificantShape], f
     rigid_motion = [judged for judged in shapes if judged.shape.kind == "misalignment"]
     if not (len(bent) == 1 and len(rigid_motion) == 1 and len(shapes) == 2):
         return shapes
-    points, outward = with_corners(search.surface, rows)
+    points, outward = with_corners(search.field.surface, rows)
     total = np.sum([judged.shape.values(frame, points, outward) for judged in shapes], axis=0)
     local = frame.local(points) / frame.half
     peak = float(total[int(np.argmax(np.abs(total)))])
@@ -191,7 +187,7 @@ def _of_held_plate(search: Search, rows: Ints, shapes: list[SignificantShape], f
 
 def _shape_defect(search: Search, fit: ComponentShape, rows: Ints, judged: SignificantShape) -> Defect:
     """Measure a shape of a component on the cells ``rows`` of its largest face."""
-    surface, component, frame, kind = search.surface, fit.component, fit.frame, judged.shape.kind
+    surface, component, frame, kind = search.field.surface, fit.component, fit.frame, judged.shape.kind
     value = judged.shape.values(frame, surface.centres[rows], surface.outward[rows])
     extent = 2.0 * frame.half[:2]
     part = np.ones(len(rows), bool)
@@ -205,7 +201,7 @@ def _shape_defect(search: Search, fit: ComponentShape, rows: Ints, judged: Signi
     if kind == RIGID:  # what is swept: a round face goes outward on one side and inward on the other
         inward, outward = (float(np.maximum(way * value, 0.0) @ area) for way in (-1.0, 1.0))
         on_face = inward if inward >= outward else -outward
-        cells = swept_cells(surface, search.field, fit, judged.shape)
+        cells = swept_cells(search.field, fit, judged.shape)
         moved = np.abs(judged.shape.values(frame, surface.centres[cells], surface.outward[cells]))
         volume = float(np.copysign(moved @ surface.cell_areas[cells], on_face))
     values = _row(
@@ -253,21 +249,21 @@ def _curvature(judged: SignificantShape, half: Floats) -> float:
 def _place_defects(search: Search) -> Iterator[Defect]:
     """Yield a defect for each place that deviates or is missing; half waves in a row are one."""
     amplitudes = {number: max(abs(shape.peak) for shape in shapes) for number, shapes in search.significant.items()}
-    claimed = np.zeros(len(search.surface.share), bool)
+    surface, claimed = search.field.surface, np.zeros(len(search.hidden), bool)
     for group in search.places:
         claimed[group[0].cells] = True
     found: list[tuple[Region, Defect]] = []
     for group in search.places:
-        component = int(search.surface.charts.component[group[0].chart])
+        component = int(surface.charts.component[group[0].chart])
         values = _place_values(search, group[0], component, amplitudes.get(component, 0.0), claimed)
         if values is not None:
             cells = np.unique(np.concatenate([region.cells for region in group]))
             found.append((group[0], Defect(values=values, component=component, cells=cells, field=search.residuals)))
-    pushed = [k for k, of_place in enumerate(found) if _is_pushed(search.surface, *of_place)]
-    behind = _other_sides(search.surface, found, pushed)
+    pushed = [k for k, of_place in enumerate(found) if _is_pushed(surface, *of_place)]
+    behind = _other_sides(surface, found, pushed)
     waving = [k for k in pushed if k not in behind]
     in_wave: set[int] = set()
-    for rows in waves.waves([_lobe(search.surface, *found[k]) for k in waving]):
+    for rows in waves.waves([_lobe(surface, *found[k]) for k in waving]):
         lobes = [waving[row] for row in rows]
         in_wave.update(lobes)
         yield _wave([found[k][1] for k in lobes])
@@ -343,13 +339,13 @@ def _place_values(
 
     ``claimed`` (cells,) marks the cells of all places.
     """
-    surface, cell = search.surface, search.surface.charts.cell_mm
+    surface, cell = search.field.surface, search.field.surface.charts.cell_mm
     middle = int(region.cells[len(region.cells) // 2])
     thickness = measures.thickness_at(surface, surface.centres[middle], surface.outward[middle], component)
     assumed = thickness if np.isfinite(thickness) else float(np.sqrt(len(region.cells))) * cell / 10.0
     size = int(np.searchsorted(search.levels.sides, np.sqrt(len(region.cells)), side="right")) - 1
     inflation = float(search.levels.inflation[max(size, 0)])
-    measured = measures.measure(region, search.residuals, surface, search.alignment, inflation, thickness)
+    measured = measures.measure(region, search.residuals, inflation, thickness)
     length, width = float(measured.extent[0]), float(measured.extent[1])
     reasons: tuple[Reason, ...] = ()
     if region.sign == 0:
@@ -357,17 +353,17 @@ def _place_values(
         if not np.isfinite(thickness):
             reasons = (reason("defects.no-thickness"),)
     else:
-        if abs(measured.depth) < SHALLOW_SHARE * amplitude:
+        if abs(measured.depth_max) < SHALLOW_SHARE * amplitude:
             return None
-        stayed = other_side.stayed(search.residuals, surface, region.cells) if region.sign < 0 else np.nan
+        stayed = other_side.stayed(search.residuals, region.cells) if region.sign < 0 else np.nan
         chosen = classification.of_deviation(region.sign, measured.diameter, length, width, assumed, region.z, stayed)
         crack = chosen.defect_class is DefectClass.CRACK
         if measured.diameter < SMALL_CELLS * cell and not crack:
-            measured = measures.refined(measured, region, search.points, search.field, search.shape_values, inflation)
+            measured = measures.refined(measured, region, search.points, search.shape_values, inflation)
             chosen = classification.of_deviation(
                 region.sign, measured.diameter, length, width, assumed, region.z, stayed
             )
-        if not abs(measured.depth) > measured.lod95:
+        if not abs(measured.depth_max) > measured.lod95:
             return None  # significant only together with the defect beside it
         if crack:
             # The plate's thickness if rays went through, else what was measured as a bound
@@ -375,37 +371,13 @@ def _place_values(
             points = (search.field.count + search.field.stray)[region.cells].sum()
             expected = search.expected[region.cells].sum()
             if expected > 0.0 and points < THROUGH_SHARE * expected and np.isfinite(thickness):
-                measured, reasons = dataclasses.replace(measured, depth=thickness), (reason("defects.through"),)
+                measured, reasons = dataclasses.replace(measured, depth_max=thickness), (reason("defects.through"),)
         else:
             chosen, measured, reasons = _by_profile(search, region, measured, chosen, assumed, inflation, claimed)
     if regions.touches(region.cells, search.hidden, surface.charts, region.chart):
         reasons = (*reasons, reason("defects.beside"))
-    return _row_of(measured, chosen, surface.names[component], region, reasons)
-
-
-def _row_of(
-    measured: Measures, classification: Classification, component: str, region: Region, reasons: tuple[Reason, ...]
-) -> dict[str, Any]:
-    """Return the values of the row of a place."""
-    return _row(
-        classification,
-        component,
-        reasons=reasons,
-        centre=measured.centre,
-        axes=measured.axes,
-        extent=measured.extent,
-        area_mm2=measured.area,
-        depth_max=measured.depth,
-        depth_ci95=measured.depth_ci95,
-        depth_mean=measured.mean,
-        volume_mm3=measured.volume,
-        volume_ci95=measured.volume_ci95,
-        edge_distance=measured.edge,
-        curvature_per_m=measured.curvature,
-        lod95=measured.lod95,
-        z=region.z,
-        chance=region.chance * CHANCE_MM2,
-    )
+    of_place = {**measured.columns(), "z": region.z, "chance": region.chance * CHANCE_MM2, "reasons": reasons}
+    return _row(chosen, surface.names[component], **of_place)
 
 
 def _by_profile(
@@ -418,14 +390,14 @@ def _by_profile(
     claimed: Bools,
 ) -> tuple[Classification, Measures, tuple[Reason, ...]]:
     """Return class, measures and reasons of a place by its profile; unchanged where that is a bump."""
-    cells = measures.cells_about(region, search.residuals, search.surface, claimed)
+    cells = measures.cells_about(region, search.residuals, claimed)
     fitted = None if cells is None else profiles.fit(cells, region.sign)
     if fitted is None or fitted.profile is Profile.BUMP:
         return chosen, measured, ()
     place, outward = measured.centre, measured.axes[2]
-    registration = measures.registration_sd(search.alignment, search.residuals, place, outward, region.cells)
+    registration = measures.registration_sd(search.residuals, place, outward, region.cells)
     measured = dataclasses.replace(
-        measured, depth=-fitted.depth, depth_ci95=NORMAL_95 * float(np.hypot(fitted.sd * inflation, registration))
+        measured, depth_max=-fitted.depth, depth_ci95=NORMAL_95 * float(np.hypot(fitted.sd * inflation, registration))
     )
     by_profile = classification.of_profile(fitted, thickness, chosen)
     is_crack = by_profile.defect_class is DefectClass.CRACK

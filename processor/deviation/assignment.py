@@ -63,9 +63,7 @@ class Aside(Columns):
 
     def put(self) -> Aside:
         """Put them aside."""
-        return Aside(
-            put_aside(self.rows), put_aside(self.facet), put_aside(self.clearance), put_aside(self.flat)
-        )  # fmt: skip
+        return Aside(*map(put_aside, vars(self).values()))
 
     def seen(self, points: Floats, curved: CurvedFacets) -> OnSurface:
         """Return what is known of the points (m, 3) that were put aside."""

@@ -17,7 +17,7 @@ from processor.deviation import cloud, result_fields
 from processor.deviation import measure as deviation_measure
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.params import Paper, Params
-from processor.deviation.result import ErrorSource, Result
+from processor.deviation.result import CorePoints, ErrorSource, Result
 from processor.geometry import m3c2, mesh_distance, rigid
 from processor.geometry.thinning import thinned
 from processor.geometry.thread_ranges import each
@@ -72,7 +72,7 @@ def _measured(design_of: StructureDesign, scan: ScanCloud, vertices: Floats, ori
         status = Status.AMBIGUOUS if status is Status.OK else status
         reasons.append(reason("deviation.paper-ambiguous", ratio=ambiguity))
     used = known if (known := distances.std2[np.isfinite(distances.lod95)]).size else np.array([NAN])
-    points = result_fields.core_points(core, normals, distances)
+    points = CorePoints(points=core, normals=normals, **vars(distances))
     how = {"none": Registration.AS_GIVEN, "fine": Registration.FINE}.get(params.register, Registration.COARSE)
     return Result(
         status=status,

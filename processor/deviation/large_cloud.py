@@ -65,10 +65,6 @@ class LargeCloud:
         rows = np.concatenate(chosen)
         return taken(self.points, rows), taken(self.view, rows).astype(np.int64)
 
-    def placed(self, T: Floats) -> Placed:
-        """Return the points placed by T (4, 4), for passes over them."""
-        return Placed(self, T)
-
 
 @dataclass(frozen=True)
 class Placed:

@@ -9,13 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from processor.adjustment import distance_summary, scanner_class_errors, view_error_from_opposite_sides
+from processor.adjustment.body_motions import distance_derivative, variances
 from processor.adjustment.distance_summary import Summary
-from processor.deviation import mean_uncertainty, result_fields, stable_fit, surface_movement
+from processor.deviation import large_cloud, mean_uncertainty, result_fields, stable_fit, surface_movement
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.local_translation import Movement
 from processor.deviation.params import Params
 from processor.deviation.placement import Placement, place
-from processor.deviation.result import ErrorSource, Result
+from processor.deviation.result import CorePoints, ErrorSource, Result
 from processor.deviation.stable_fit import Fits
 from processor.deviation.station_offsets import CELL_DIAMETERS
 from processor.deviation.surface_movement import Cloud
@@ -112,7 +113,7 @@ def _measured(scan: ScanCloud, curved: CurvedFacets, T: Floats, params: Params, 
     core_spacing = params.core_spacing_mm or max(CORE_SHARE * diameter, float(np.sqrt(area / MOST_CORE)))
     core = mesh_distance.sampled(surface.vertices, surface.faces, core_spacing)
     depth = params.max_depth_mm or _depth(few.points, surface)
-    clouds = [few] if most or scan.large is None else scan.large.placed(T)
+    clouds = [few] if most or scan.large is None else large_cloud.Placed(scan.large, T)
     scanners = None if scan.scanners is None else rigid.apply(T, scan.scanners)
     moved, share, shared = surface_movement.movement(clouds, scanners, core, curved, diameter, depth)
     views = 0.0
@@ -195,7 +196,9 @@ def registration_error(measured: Measured, fits: Fits, placed: Placed, params: P
     if np.isfinite(fit.error_mm):
         sd, motion = fit.error_mm, fit.motion
     elif np.isfinite(covariance).all() and known.any():
-        sd = surface_registration.error_along(covariance, core.points[known], core.normals[known])
+        # Rms over the core points of the standard deviation along their normals
+        J = distance_derivative(core.points[known], core.normals[known])
+        sd = float(np.sqrt(np.mean(variances(J, covariance))))
         motion = placed.T @ rigid.invert(placed.T_best_fit)
     else:
         return RegistrationError(0.0, ErrorSource.UNKNOWN, none)
@@ -249,7 +252,7 @@ def _result(
     total = distance_summary.of_distances(
         distance, core.points, core.normals, measured.diameter, m3c2.PAPER_POINTS_A_CYLINDER
     )
-    points = result_fields.core_points(core.points, core.normals, distance)
+    points = CorePoints(points=core.points, normals=core.normals, **vars(distance))
     if not fits.determined and placed.registration is Registration.AS_GIVEN:
         best = _shifted(scan, placed.T, placed.T_best_fit)
     else:

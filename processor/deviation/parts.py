@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 
 from processor.adjustment import distance_summary
+from processor.components import bridge_parts
 from processor.components.bridge_parts import PartScene
 from processor.deviation import result_fields
 from processor.deviation.result import CorePoints, ErrorSource, PartFits, Result
 from processor.geometry import m3c2
 from processor.limits.judging import JudgedLimits
-from processor.model import Floats, Reason, Scene, Status, reason
+from processor.model import Scene, Status
 
 
 def deviations(parts: Sequence[PartScene], method: str, one: Callable[[Scene], Result]) -> Result:
@@ -24,15 +25,13 @@ def deviations(parts: Sequence[PartScene], method: str, one: Callable[[Scene], R
     results = [part_result(part, method, one) for part in parts]
     known = [result for result in results if len(result.core)]
     table = _table(parts, results)
-    failed = [result.status is Status.FAILED for result in results]
-    status = Status.FAILED if all(failed) else Status.PARTIAL if any(failed) else Status.OK
-    if status is Status.OK and any(result.status is not Status.OK for result in results):
-        status = Status.WEAK
-    reasons = (reason("parts.each-at-its-best-fit"), *_doubts(parts, results))
+    status, reasons = bridge_parts.together(parts, results)
     if not known:
         return Result(status=status, method=method, reasons=reasons, parts=table)
     origin = known[0].origin
-    core = _joined([result.core for result in known], [result.origin - origin for result in known])
+    shifted = [replace(result.core, points=result.core.points + (result.origin - origin)) for result in known]
+    core = CorePoints.concat(shifted)
+    core = replace(core, body=np.full_like(core.body, -1))  # rows of one part's bodies, which the whole does not name
     total = distance_summary.of_distances(
         core.distances, core.points, core.normals, known[0].projection_diameter, m3c2.PAPER_POINTS_A_CYLINDER
     )
@@ -68,21 +67,6 @@ def part_result(part: PartScene, method: str, one: Callable[[Scene], Result]) ->
     if part.status is Status.AMBIGUOUS and found.status is not Status.FAILED:
         return replace(found, status=Status.AMBIGUOUS)
     return found
-
-
-def _doubts(parts: Sequence[PartScene], results: Sequence[Result]) -> list[Reason]:
-    return [
-        reason("parts.of-part", part=part.name, why=result.reasons[:1])
-        for part, result in zip(parts, results, strict=True)
-        if result.status is not Status.OK and result.reasons
-    ]
-
-
-def _joined(cores: Sequence[CorePoints], shifts: Sequence[Floats]) -> CorePoints:
-    core = CorePoints.concat(
-        [replace(core, points=core.points + shift) for core, shift in zip(cores, shifts, strict=True)]
-    )
-    return replace(core, body=np.full_like(core.body, -1))  # rows of one part's bodies, which the whole does not name
 
 
 def _table(parts: Sequence[PartScene], results: Sequence[Result]) -> PartFits:

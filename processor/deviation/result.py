@@ -75,9 +75,7 @@ class CorePoints(Rows):
     @property
     def distances(self) -> Distances:
         """The columns of M3C2."""
-        return Distances(
-            distance=self.distance, lod95=self.lod95, n1=self.n1, n2=self.n2, std1=self.std1, std2=self.std2
-        )
+        return Distances(**{one.name: getattr(self, one.name) for one in dataclasses.fields(Distances)})
 
 
 @dataclass(frozen=True)

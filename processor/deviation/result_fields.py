@@ -8,24 +8,8 @@ import numpy as np
 
 from processor.adjustment.distance_summary import Summary
 from processor.deviation.result import NAN, CorePoints
-from processor.geometry.m3c2 import Distances
-from processor.model import Floats
 
 NEAR_MM = 10.0  # of the key within_10mm_share
-
-
-def core_points(points: Floats, normals: Floats, distances: Distances) -> CorePoints:
-    """Return core points (k, 3) with normals (k, 3) and the distances at them."""
-    return CorePoints(
-        points=points,
-        normals=normals,
-        distance=distances.distance,
-        lod95=distances.lod95,
-        n1=distances.n1,
-        n2=distances.n2,
-        std1=distances.std1,
-        std2=distances.std2,
-    )
 
 
 def statistics(core: CorePoints, total: Summary) -> dict[str, Any]:

@@ -90,14 +90,6 @@ class _Passes:
             release()
 
 
-class _Near(NamedTuple):
-    """Points (n, 3) near the surface, which of them may be outliers, and what was put aside."""
-
-    points: Floats
-    doubtful: Bools
-    aside: Aside
-
-
 class _Around(NamedTuple):
     """The ``known`` core points (m,), a tree of them, and the scatter (k,) about all core points."""
 
@@ -174,8 +166,7 @@ def _first(passes: _Passes) -> tuple[Movement, float]:
     _mark_mixed(passes, faces)
     _leave_out_beside(passes)
     first = passes.fit.value.sums()
-    close = (_Near(cloud.points, cloud.doubtful, aside) for cloud, aside in passes.near())
-    for part in tiles.mapped(_first_of, close, passes.fit):
+    for part in tiles.mapped(_first_of, passes.near(), passes.fit):
         first.add_part(part)
     return first.movement(), near / points
 
@@ -192,9 +183,10 @@ def _assigned_of(cloud: Cloud, fit: _Fit) -> tuple[Aside, Bools, _Faces, tuple[i
     return Aside.of(np.flatnonzero(close), seen), cloud.doubtful[close], _Faces(face, seen.distance[close]), counts
 
 
-def _first_of(near: _Near, fit: _Fit) -> PartSums:
+def _first_of(near: tuple[Cloud, Aside], fit: _Fit) -> PartSums:
     """Return sums over the points of a cloud near the surface, doubtful ones left out."""
-    seen, sure = near.aside.seen(near.points, fit.curved), np.flatnonzero(~near.doubtful)
+    cloud, aside = near
+    seen, sure = aside.seen(cloud.points, fit.curved), np.flatnonzero(~cloud.doubtful)
     return fit.part(fit.sums(), seen.take(sure), seen.distance[sure])
 
 
@@ -255,19 +247,19 @@ def _second(passes: _Passes, around: _Around) -> tuple[list[Ints], Movement, Mov
     and for its own.
     """
     nearest, about, moved = list[Ints](), passes.fit.value.about(), passes.fit.value.sums()
-    near = (_Near(cloud.points, cloud.doubtful, aside) for cloud, aside in passes.near())
-    for at, *parts in tiles.mapped(_second_of, near, passes.fit, Shared(around)):
+    for at, *parts in tiles.mapped(_second_of, passes.near(), passes.fit, Shared(around)):
         nearest.append(put_aside(at))
         for sums, part in zip((about, moved), parts, strict=True):
             sums.add_part(part)
     return nearest, about.movement(), moved.movement()
 
 
-def _second_of(near: _Near, fit: _Fit, around: _Around) -> tuple[Ints, PartSums, PartSums]:
+def _second_of(near: tuple[Cloud, Aside], fit: _Fit, around: _Around) -> tuple[Ints, PartSums, PartSums]:
     """Return what :func:`_second` needs of the points of a cloud."""
-    seen = near.aside.seen(near.points, fit.curved)
+    cloud, aside = near
+    seen = aside.seen(cloud.points, fit.curved)
     at = around.known[around.tree.query(seen.feet, workers=-1)[1]] if len(seen.feet) else around.known[:0]
-    rows = np.flatnonzero(assignment.clear(seen, around.scatter[at]) & ~near.doubtful)
+    rows = np.flatnonzero(assignment.clear(seen, around.scatter[at]) & ~cloud.doubtful)
     clear = seen.take(rows)
     about, moved = (fit.part(sums, clear, clear.distance) for sums in (fit.about(), fit.sums()))
     return at.astype(np.int32), about, moved

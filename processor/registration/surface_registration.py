@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from processor.adjustment import robust_least_squares
-from processor.adjustment.body_motions import distance_derivative, transform_about, variances
+from processor.adjustment.body_motions import distance_derivative, transform_about
 from processor.geometry import rigid
 from processor.geometry.mesh_distance import MeshSurface, on_face
 from processor.geometry.thinning import thinned
@@ -329,9 +329,3 @@ def fits_design(placed: Placed, points: Floats, surface: MeshSurface) -> bool:
 def is_unproven(reasons: Iterable[Reason]) -> bool:
     """Whether step deviation states that single points scatter as they do at a wrong pose; see :func:`most_scatter`."""
     return any(one.code == "deviation.no-fit" for one in reasons)
-
-
-def error_along(covariance: Floats, places: Floats, normals: Floats) -> float:
-    """Rms over places (k, 3) of the standard deviation along normals (k, 3) that a pose's covariance causes, mm."""
-    variance = variances(distance_derivative(places, normals), covariance)
-    return float(np.sqrt(np.mean(variance))) if len(variance) else NAN

@@ -178,9 +178,9 @@ def test_empty_cells_are_missing_where_they_are_rarer_than_the_alarms_that_are_a
     cell = int(np.argmin(off.sum(axis=1)))
     count = np.where((off.max(axis=1) < 10.0 * wide) & (surface.outward[:, 2] > 0.5), 0.0, expected)
     assert (count == 0.0).sum() == wide**2
-    field = SimpleNamespace(count=count, stray=0, inner=np.ones(len(count)))
+    field = SimpleNamespace(surface=surface, count=count, stray=0, inner=np.ones(len(count)))
     chance = np.exp(-0.5 * expected) / 20.0**2  # of one mm2
     for alarms, found in ((0.99 * chance, 0), (1.01 * chance, 1)):
-        missing = regions.missing(field, np.full(len(count), expected), surface, alarms)
+        missing = regions.missing(field, np.full(len(count), expected), alarms)
         one = [(0, [cell], pytest.approx(np.sqrt(expected)), pytest.approx(chance))]  # z^2 / 2 = expected / 2
         assert [(region.sign, list(region.cells), region.z, region.chance) for region in missing] == one[:found]

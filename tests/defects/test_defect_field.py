@@ -129,7 +129,7 @@ def ribs(seed, between):
     """The surface of ten plates, and pairs that differ by an error of the view of each side."""
     surface = surface_of(tuple(((500.0 * k, 0, 0), (500.0 * k + 14.0, 400, 600)) for k in range(10)), 20.0)
     rng = np.random.default_rng(seed)
-    side = alignment.chart_of_cells(surface)
+    side = surface.chart
     error = between * rng.normal(size=int(side.max()) + 1)
     noise = rng.normal(0.0, SIGMA / np.sqrt(POINTS), len(side))
     return surface, pairs_of(surface, seed, error[side] + noise)
@@ -147,15 +147,15 @@ def test_differences_of_unnamed_views_are_no_defect_but_a_dent_is():
         surface, pairs = ribs(seed, 0.5)
         named, unnamed = (field_of(surface, pairs, stations) for stations in (NAMED, UNNAMED))
         # The scatter of windows alone: it is not known that whole faces move alike.
-        first, levels = (scan_statistic.levels_of(field, surface, 1e-8, 0.02) for field in (named, unnamed))
+        first, levels = (scan_statistic.levels_of(field, 1e-8, 0.02) for field in (named, unnamed))
         assert first.inflation[0] > 2.0
         assert (levels.inflation < first.inflation).all()
-        assert not scan_statistic.search(unnamed, surface, levels).sign.any()
-        assert scan_statistic.search(named, surface, levels).sign.any()
+        assert not scan_statistic.search(unnamed, levels).sign.any()
+        assert scan_statistic.search(named, levels).sign.any()
         off = np.linalg.norm(surface.centres[:, 1:] - [200.0, 300.0], axis=1)
         on = (off < 100.0) & (surface.outward[:, 0] > 0.5) & (surface.centres[:, 0] < 20.0)
         dented = unnamed.minus(np.where(on, 10.0 * np.cos(0.5 * np.pi * np.minimum(off / 100.0, 1.0)), 0.0))
-        assert scan_statistic.search(dented, surface, levels).sign[on & (off < 60.0)].all()
+        assert scan_statistic.search(dented, levels).sign[on & (off < 60.0)].all()
 
 
 def test_the_pose_of_unnamed_views_has_the_covariance_of_the_class():
@@ -193,7 +193,7 @@ def test_a_cell_that_a_far_station_sees_alone_has_its_noise():
 def test_few_degrees_of_freedom_need_larger_deviations():
     surface = surface_of(BOX, 20.0)
     known = dataclasses.replace(field_of(surface, pairs_of(surface, 1)), dof=np.empty(0))
-    levels = scan_statistic.levels_of(known, surface, 1e-8, 0.0)
+    levels = scan_statistic.levels_of(known, 1e-8, 0.0)
     up = np.flatnonzero((known.seen > 0) & (surface.outward[:, 2] > 0.5))
     deviation = known.deviation.copy()
     deviation[up[len(up) // 2]] = 1.15 * levels.threshold[0] * levels.inflation[0] * np.sqrt(known.variance[up[0]])
@@ -201,7 +201,7 @@ def test_few_degrees_of_freedom_need_larger_deviations():
     for dof in (30.0, 1e6):
         field = dataclasses.replace(known, deviation=deviation, dof=np.full(len(deviation), dof))
         field = scan_statistic.widened(field, levels)
-        found[dof] = bool(scan_statistic.search(field, surface, levels).sign.any())
+        found[dof] = bool(scan_statistic.search(field, levels).sign.any())
     assert found == {30.0: False, 1e6: True}
 
 
@@ -217,7 +217,8 @@ def test_a_bend_is_no_movement_where_the_pose_is_not_of_the_design(fitted, mean,
     bend = shape_models.Shape("bend", (0, 2), np.array([2.0]), np.array([[0.01]]))
     fit, levels = ComponentShape(0, frame, blocks, None), SimpleNamespace(common=np.array([0.1]), systematic_mm=0.2)
     of_pose = SimpleNamespace(fitted=fitted, sd=lambda points, _: np.full(len(points), 0.3))
-    value, own, sd, shared = component_deviations._errors(fit, bend, surface, field, of_pose, levels)
+    field = dataclasses.replace(field, alignment=of_pose)
+    value, own, sd, shared = component_deviations._errors(fit, bend, field, levels)
     # Cells of a fiftieth of the length: a ten-thousandth. Signs are those of the front, above or below.
     np.testing.assert_allclose(np.abs(value - own), 2.0 * mean, rtol=1e-3)
     np.testing.assert_allclose(sd, 0.05 * np.abs(value), rtol=1e-9)
@@ -229,7 +230,7 @@ def test_means_of_windows_scatter_by_the_root_of_their_cells(side):
     surface = surface_of(BOX, 20.0)
     field = field_of(surface, pairs_of(surface, 1, np.zeros(len(surface.share))))
     even = dataclasses.replace(field, variance=np.full(len(field.variance), 0.04), deviation=0.5 + 0.0 * field.variance)
-    z, sd = scan_statistic._windows(even, surface.charts, scan_statistic._used(even, surface.charts), side)
+    z, sd = scan_statistic._windows(even, scan_statistic._used(even), side)
     assert sd.min() == pytest.approx(0.2 / side)  # of windows that were seen whole
     assert z.max() == pytest.approx(0.5 * side / 0.2)
     np.testing.assert_allclose(z * sd, 0.5)
@@ -239,13 +240,13 @@ def test_a_region_ends_where_its_cells_deviate_less():
     """Squares of four cells are significant from 5.2 sds: with two of 4 sds and two of 1.5, below 2.5, as well."""
     surface = surface_of(BOX, 20.0)
     field = field_of(surface, pairs_of(surface, 1, np.zeros(len(surface.share))))
-    levels = scan_statistic.levels_of(field, surface, 1e-8, 0.0)
+    levels = scan_statistic.levels_of(field, 1e-8, 0.0)
     assert levels.threshold[1] == pytest.approx(-norm.ppf(0.5e-8 * 400.0 / (len(levels.sides) + 2)))
     off = np.abs(surface.centres[:, :2] - [500.0, 300.0]).max(axis=1)
     up = (field.seen > 0) & (surface.outward[:, 2] > 0.5)
     sds = np.where(up & (off < 80.0), np.where(off < 60.0, 4.0, 1.5), 0.0)
     deviation = sds * np.sqrt(field.variance)
-    found = scan_statistic.search(dataclasses.replace(field, deviation=deviation), surface, levels).sign
+    found = scan_statistic.search(dataclasses.replace(field, deviation=deviation), levels).sign
     np.testing.assert_array_equal(found, sds > 2.5)
 
 
@@ -253,7 +254,7 @@ def test_single_cell_in_line_with_a_ridge_is_not_part_of_its_region():
     """A ridge of one cell's width, and a cell in line with it that deviates as one in fifteen does by chance."""
     surface = surface_of(BOX, 20.0)
     field = field_of(surface, pairs_of(surface, 1, np.zeros(len(surface.share))))
-    levels = scan_statistic.levels_of(field, surface, 1e-8, 0.0)
+    levels = scan_statistic.levels_of(field, 1e-8, 0.0)
     up = (field.seen > 0) & (surface.outward[:, 2] > 0.5)
     row = np.flatnonzero(up & (np.abs(surface.centres[:, 1] - surface.centres[up, 1][0] - 300.0) < 1.0))
     row = row[np.argsort(surface.centres[row, 0])]
@@ -261,7 +262,7 @@ def test_single_cell_in_line_with_a_ridge_is_not_part_of_its_region():
     deviation = np.zeros(len(surface.share))
     deviation[ridge] = 3.5 * np.sqrt(field.variance[ridge])
     deviation[beyond] = 1.5 * np.sqrt(field.variance[beyond])
-    found = scan_statistic.search(dataclasses.replace(field, deviation=deviation), surface, levels).sign
+    found = scan_statistic.search(dataclasses.replace(field, deviation=deviation), levels).sign
     assert set(np.flatnonzero(found)) == set(ridge)
 
 
@@ -270,7 +271,7 @@ def test_a_region_is_significant_by_its_own_cells():
     surface = surface_of(BOX, 20.0)
     field = field_of(surface, pairs_of(surface, 1, np.zeros(len(surface.share))))
     levels = dataclasses.replace(
-        scan_statistic.levels_of(field, surface, 1e-8, 0.0), threshold=np.full(len(scan_statistic.SIDES), 5.0)
+        scan_statistic.levels_of(field, 1e-8, 0.0), threshold=np.full(len(scan_statistic.SIDES), 5.0)
     )
     cells = np.flatnonzero((field.seen > 0) & (surface.outward[:, 2] > 0.5))[:9]
     deviating = dataclasses.replace(field, deviation=np.sqrt(field.variance) * 1.7 * levels.inflation.max())
@@ -298,11 +299,11 @@ BOXES = tuple(((2_000 * i, 0, 0), (2_000 * i + 1_000, 600, 400)) for i in range(
 )
 def test_what_all_bodies_are_off_by_is_a_bias(off, of_one, common):
     surface = surface_of(BOXES, 25.0)
-    body = deviation_field.component_of_cells(surface)
+    body = surface.component
     noise = np.random.default_rng(8).normal(0.0, SIGMA / np.sqrt(POINTS), len(body))
     field = field_of(surface, pairs_of(surface, 8, np.where(body == 0, of_one, off) + noise))
     # Medians of thousands of cells: SIGMA / sqrt(12 * 1000) = 0.005 each, of which the median of six is taken.
-    assert deviation_field.common_bias(field, surface) == pytest.approx(common, abs=0.01)
+    assert deviation_field.common_bias(field) == pytest.approx(common, abs=0.01)
 
 
 @pytest.mark.parametrize("off", [0.3, 0.0])
@@ -322,7 +323,7 @@ def test_a_bias_of_all_bodies_is_stated_with_its_size_and_is_no_defect(off):
 def test_what_the_sides_of_plates_differ_by_is_without_a_layer_that_all_have(layer, apart, drift):
     """Sums of two sides of 0.2 mm either way: their squares by twice the variance of a side have the median 0.4549."""
     surface = surface_of(tuple(((2_000 * i, 0, 0), (2_000 * i + 1_000, 600, 20)) for i in range(6)), 25.0)
-    body, up = deviation_field.component_of_cells(surface), surface.outward[:, 2]
+    body, up = surface.component, surface.outward[:, 2]
     noise = np.random.default_rng(8).normal(0.0, SIGMA / np.sqrt(POINTS), len(body))
     off = layer + apart * np.where(up > 0.5, np.where(body % 2 == 0, 1.0, -1.0), 0.0)
     field = field_of(surface, pairs_of(surface, 8, off + noise))
@@ -334,7 +335,7 @@ def test_faces_that_all_face_one_way_show_no_bias():
     surface = surface_of(BOXES, 25.0)
     up = (surface.outward[:, 2] > 0.9).astype(float)
     field = field_of(surface, pairs_of(surface, 9, np.full(len(up), 0.2)))
-    assert deviation_field.common_bias(dataclasses.replace(field, seen=field.seen * up), surface) == 0.0
+    assert deviation_field.common_bias(dataclasses.replace(field, seen=field.seen * up)) == 0.0
 
 
 def test_bias_that_more_points_do_not_reduce_is_no_deviation_of_well_seen_windows():

@@ -92,8 +92,8 @@ def test_a_movement_sweeps_the_volume_of_faces_that_were_seen():
     frame = shape_models.Frame(np.array([100.0, 50.0, 25.0]), np.eye(3), np.array([100.0, 50.0, 25.0]), 50.0)
     shape = shape_models.Shape(shape_models.RIGID, (), np.array([0.0, 0.0, -3.0, 0.0, 0.0, 0.0]))
     for up in (1.0, -1.0):
-        seen = SimpleNamespace(seen=(up * surface.outward[:, 2] > 0.5).astype(float))
-        cells = component_deviations.swept_cells(surface, seen, ComponentShape(0, frame, None, None), shape)
+        seen = SimpleNamespace(surface=surface, seen=(up * surface.outward[:, 2] > 0.5).astype(float))
+        cells = component_deviations.swept_cells(seen, ComponentShape(0, frame, None, None), shape)
         np.testing.assert_allclose(surface.outward[cells], np.tile([0.0, 0.0, up], (len(cells), 1)), atol=1e-12)
         assert surface.share[cells].sum() * 20.0**2 == pytest.approx(200.0 * 100.0, rel=0.3)  # whole cells of 20 mm
 
@@ -109,13 +109,15 @@ def test_a_bias_of_the_scanner_moves_what_is_seen_from_one_side(seen_from, share
     ones = np.ones(len(at))
     blocks = shape_models.Blocks(surface.centres[at], surface.outward[at], 0.0 * ones, ones, 5.0)
     moved = shape_models.rigid_motion(dataclasses.replace(blocks, mean=ones), frame)
-    field = SimpleNamespace(seen=np.zeros(len(surface.share)), drift=0.0, stations_sd=lambda *_, **__: 0.0)
+    still = SimpleNamespace(sd=lambda points, outward: np.zeros(len(points)), fitted=True)
+    field = SimpleNamespace(
+        surface=surface, alignment=still, seen=0.0 * surface.share, drift=0.0, stations_sd=lambda *_, **__: 0.0
+    )
     field.seen[at] = 1.0
     levels = SimpleNamespace(common=np.zeros(1), systematic_mm=0.0)
-    still = SimpleNamespace(sd=lambda points, outward: np.zeros(len(points)), fitted=True)
     shape = dataclasses.replace(moved, covariance=np.zeros((6, 6)))
     fit = ComponentShape(0, frame, blocks, None)
-    shared = component_deviations._errors(fit, shape, surface, field, still, levels)[3]
+    shared = component_deviations._errors(fit, shape, field, levels)[3]
     np.testing.assert_allclose(shared, share * scanner_class_errors.known().incidence_mm, atol=0.01)
 
 
@@ -142,16 +144,18 @@ def test_a_face_that_lies_deeper_as_a_whole_has_the_volume_of_its_area():
     surface, top = top_of_the_box()
     count = len(surface.share)
     field = SimpleNamespace(
+        surface=surface,
+        alignment=alignment.none(surface, 1, error_mm=0.006),
         deviation=np.full(count, -2.0),
         variance=np.full(count, 0.04),
         seen=np.ones(count),
         stations_sd=lambda cells: 0.008,
     )
-    found = measures.measure(top, field, surface, alignment.none(surface, 1, error_mm=0.006), 1.5, 50.0)
-    assert (found.area, found.mean, found.volume) == pytest.approx((20_000.0, 2.0, 40_000.0))
+    found = measures.measure(top, field, 1.5, 50.0)
+    assert (found.area_mm2, found.depth_mean, found.volume_mm3) == pytest.approx((20_000.0, 2.0, 40_000.0))
     noise, common = 1.5 * 0.2 * np.sqrt(50.0) * 20.0**2, 0.01 * 20_000.0
     assert found.volume_ci95 == pytest.approx(NORMAL_95 * np.hypot(noise, common), rel=1e-9)
-    assert found.depth == pytest.approx(2.0)
+    assert found.depth_max == pytest.approx(2.0)
     np.testing.assert_allclose(found.extent, [200.0, 100.0])
     np.testing.assert_allclose(found.centre, [100.0, 50.0, 50.0], atol=1e-9)
 
@@ -193,7 +197,7 @@ def test_a_step_covers_the_part_of_its_face_beyond_its_edge():
         peak=-3.0, ci95=0.2, volume_ci95=700.0, z=9.0, chance=0.0, margin=9.0,
     )  # fmt: skip
     seen = np.ones(len(surface.share))
-    search = SimpleNamespace(surface=surface, field=SimpleNamespace(seen=seen), hidden=seen < 1.0)
+    search = SimpleNamespace(field=SimpleNamespace(surface=surface, seen=seen), hidden=seen < 1.0)
     values = to_result._shape_defect(search, ComponentShape(0, frame, None, None), top.cells, judged).values
     assert values["extent"] == pytest.approx([75.0, 100.0])
     assert values["area_mm2"] == pytest.approx(75.0 * 100.0, rel=0.1)  # whole cells of 20 mm
@@ -208,9 +212,9 @@ def test_a_picture_has_the_cells_of_the_search_or_larger_ones_where_these_are_to
     monkeypatch.setattr(defect_grids, "MOST_SIDE", most)
     surface, top = top_of_the_box()
     along = surface.centres @ surface.charts.axes[top.chart, 0]
-    field = SimpleNamespace(deviation=along, variance=np.ones(len(along)), count=np.ones(len(along)))
+    field = SimpleNamespace(surface=surface, deviation=along, variance=np.ones(len(along)), count=np.ones(len(along)))
     centre = np.array([100.0, 50.0, 50.0])
-    (picture,) = defect_grids.of_defects([(centre, top.cells[:3], field, 0)], surface)
+    (picture,) = defect_grids.of_defects([(centre, top.cells[:3], field, 0)])
     assert picture.cell == cell
     whole = picture.deviation[: int(along[top.cells].max() - along[top.cells].min() + 20.0) // int(cell)]
     at = centre @ surface.charts.axes[top.chart, 0] + picture.low[0] + cell * (np.arange(len(whole)) + 0.5)
@@ -227,19 +231,22 @@ def test_a_small_bump_is_as_deep_as_its_points_where_cells_show_at_least_a_quart
     middle = surface.charts.low[region.chart] + 10.0 * surface.charts.shape[region.chart]
     uv = middle + np.random.default_rng(0).uniform(-40.0, 40.0, (3_000, 2))
     deviation = -inward * 6.0 * np.exp(-((np.linalg.norm(uv - middle, axis=1) / 15.0) ** 3))
-    points = SimpleNamespace(
-        about=lambda *_: (uv, deviation), surface=surface, alignment=alignment.none(surface, 1, error_mm=1.0)
+    field = SimpleNamespace(
+        surface=surface,
+        alignment=alignment.none(surface, 1, error_mm=1.0),
+        noise=np.full(len(surface.share), 0.1),
+        stations_sd=lambda cells: 0.75,
     )
-    field = SimpleNamespace(noise=np.full(len(surface.share), 0.1), stations_sd=lambda cells: 0.75)
+    points = SimpleNamespace(about=lambda *_: (uv, deviation), field=field)
     rest = dict.fromkeys((one.name for one in dataclasses.fields(measures.Measures)), 0.0)
-    known = {"centre": np.array([100.0, 50.0, 50.0]), "axes": np.eye(3), "depth": inward * by_cells, "diameter": 40.0}
-    cells = measures.Measures(**rest | known)
-    found = measures.refined(cells, region, points, field, np.zeros(0), 0.0)
+    known = {"centre": np.array([100.0, 50.0, 50.0]), "axes": np.eye(3), "diameter": 40.0}
+    cells = measures.Measures(**rest | known | {"depth_max": inward * by_cells})
+    found = measures.refined(cells, region, points, np.zeros(0), 0.0)
     if not taken:  # a fit to the rest of the points that deviate less than the cells allow is not believed
         assert found is cells
         return
-    assert found.depth == pytest.approx(inward * 6.0, rel=1e-5)  # as least squares converges
-    assert found.curvature == pytest.approx(2.0 * 6.0 / 15.0**2 * 1000.0, rel=1e-4)
+    assert found.depth_max == pytest.approx(inward * 6.0, rel=1e-5)  # as least squares converges
+    assert found.curvature_per_m == pytest.approx(2.0 * 6.0 / 15.0**2 * 1000.0, rel=1e-4)
     assert found.diameter == pytest.approx(30.0 * np.log(50.0) ** (1.0 / 3.0), rel=1e-4)  # where it is a fiftieth
     assert found.depth_ci95 == pytest.approx(1.96 * 1.25, rel=1e-4)  # 1 mm of the pose and 0.75 of views
 

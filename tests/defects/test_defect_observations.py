@@ -1,5 +1,7 @@
 """Points of a scan on the cells of a design: effect of noise on places of points and means of cells."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import trimesh
@@ -84,7 +86,7 @@ def test_points_in_blocks_and_parts_are_those_at_once(monkeypatch, tmp_path):
     def found():
         observed = observations.observe(scene, np.eye(4), surface, 60.0)
         pairs = observations.paired(observed, surface)
-        by_cell = measures.points_by_cell(observed, surface, alignment.none(surface, 3, 1.0))
+        by_cell = measures.points_by_cell(observed, SimpleNamespace(surface=surface, deviation=surface.share))
         cell_mm = observations.fitting_cell(observed, surface, 12.0, (5.0, 60.0))
         aligned = alignment.align(pairs, surface, observed.stations, 1.0)
         variance = alignment.station_variance(pairs, surface, observed.stations, aligned)

@@ -256,11 +256,10 @@ def test_false_alarms_are_no_more_than_asked_for():
     for seed in range(runs):
         noise = np.random.default_rng(seed).normal(0.0, 0.1, len(seen))
         ones = np.ones(len(seen), np.int64)
-        field = deviation_field.Field(
-            noise, np.full(len(seen), 0.01), 9 * ones, 0 * ones, 0.3 * seen, seen, seen, 0 * ones, 0 * ones
-        )
-        levels = scan_statistic.levels_of(field, plate, 1e-8, 0.0)
-        sign = scan_statistic.search(field, plate, levels).sign
+        columns = noise, np.full(len(seen), 0.01), 9 * ones, 0 * ones, 0.3 * seen, seen, seen, 0 * ones, 0 * ones
+        field = deviation_field.Field(plate, alignment.none(plate, 1, 0.0), *columns)
+        levels = scan_statistic.levels_of(field, 1e-8, 0.0)
+        sign = scan_statistic.search(field, levels).sign
         alarms += int((np.abs(plate.charts.image(sign.astype(float), chart)) > 0).any())
     assert alarms < runs  # in each of which 1 is allowed: at 0.63 a run, eight of eight is one in forty
     assert np.all(levels.inflation < 1.1)

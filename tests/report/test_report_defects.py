@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from processor.defects import defect_grids, surface_charts
+from processor.defects import alignment, defect_grids, surface_charts
 from processor.defects.deviation_field import Field
 from processor.defects.result import Result
 from processor.evaluation.evaluate import ErrorReport
@@ -75,17 +75,18 @@ def plates():
     found = surface_charts.of_mesh(np.vstack([corners, strip]), np.vstack([faces, faces + 4]), 10.0)
     ones = np.ones(len(found.share))
     none = np.zeros(len(ones), np.int64)
-    return found, Field(1e-3 * found.centres[:, 0], ones, none + 1, none, ones, ones, ones, none, none)
+    still = alignment.none(found, 1, 0.0)
+    return found, Field(found, still, 1e-3 * found.centres[:, 0], ones, none + 1, none, ones, ones, ones, none, none)
 
 
 @pytest.mark.parametrize("most", [2000, 60])
 def test_few_points_are_all_drawn_and_many_thinned_evenly_on_every_face(plates, most):
     found, field = plates
     origin = np.array([1000.0, 2000.0, 0.0])
-    whole = defect_grids.of_surface([], field, found, origin)
+    whole = defect_grids.of_surface([], field, origin)
     np.testing.assert_array_equal(whole.points, found.centres + origin)
     assert (whole.defect == -1).all()
-    made = defect_grids.of_surface([], field, found, np.zeros(3), most)
+    made = defect_grids.of_surface([], field, np.zeros(3), most)
     at = made.points
     assert 0.3 * most < len(at) <= most
     np.testing.assert_allclose(made.deviation, 1e-3 * at[:, 0])
@@ -99,12 +100,12 @@ def test_small_defects_are_drawn_in_full_above_large_ones(plates):
     found, field = plates
     away = np.linalg.norm(found.centres - [1000.0, 0.0, 500.0], axis=1)
     small, large = np.flatnonzero(away < 60.0), np.flatnonzero(found.centres[:, 1] == 0.0)
-    made = defect_grids.of_surface([large, small], field, found, np.zeros(3), 500)
+    made = defect_grids.of_surface([large, small], field, np.zeros(3), 500)
     count = np.bincount(made.defect + 1, minlength=3)
     assert count[2] == len(small)
     assert 300 < count[1] < 500
     unseen = dataclasses.replace(field, count=np.where(away < 60.0, 0, 1))
-    assert (defect_grids.of_surface([small], unseen, found, np.zeros(3), 500).defect == -1).all()
+    assert (defect_grids.of_surface([small], unseen, np.zeros(3), 500).defect == -1).all()
 
 
 def test_every_defect_has_a_page():

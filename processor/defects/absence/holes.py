@@ -20,7 +20,7 @@ from processor.defects.deviation_field import Field
 from processor.defects.places import other_side
 from processor.defects.regions import EMPTY_SHARE, Region, chernoff
 from processor.defects.scan_statistic import EIGHT_NEIGHBOURS
-from processor.defects.surface_charts import PLANE, DesignSurface, chart_of_cells
+from processor.defects.surface_charts import PLANE, DesignSurface
 from processor.geometry import mesh_distance
 from processor.model import Bools, Floats, Ints
 
@@ -57,14 +57,14 @@ class _Hole:
     spread: float  # variance of a number of points by that of a Poisson distribution
 
 
-def holes(field: Field, surface: DesignSurface, points: Floats, alarms_per_mm2: float) -> list[Region]:
+def holes(field: Field, points: Floats, alarms_per_mm2: float) -> list[Region]:
     """Return the empty places of plates of which both sides must have been seen; ``points`` (n, 3) are of the cloud."""
-    count = (field.count + field.stray).astype(np.float64)
+    surface, count = field.surface, (field.count + field.stray).astype(np.float64)
     opposite: dict[int, int] = {}
     found: list[_Hole] = []
     for chart in np.flatnonzero(surface.charts.kind == PLANE):
-        for cells, ring in _empty_regions(field, surface, count, int(chart)):
-            hole = _hole(field, surface, count, int(chart), cells, ring)
+        for cells, ring in _empty_regions(field, count, int(chart)):
+            hole = _hole(field, count, int(chart), cells, ring)
             if hole is None or not (hole.bitten or _is_beyond(surface, hole, ring, points)):
                 continue
             other = other_side.cells_opposite(surface, hole.core)
@@ -100,10 +100,10 @@ def _strength(hole: _Hole, part: float) -> float:
     return chernoff(part * hole.expected, part * hole.counted, more=False) / hole.spread
 
 
-def _empty_regions(field: Field, surface: DesignSurface, count: Floats, chart: int) -> list[tuple[Ints, Ints]]:
+def _empty_regions(field: Field, count: Floats, chart: int) -> list[tuple[Ints, Ints]]:
     """Return connected empty cells of a face, each with the seen cells about them."""
-    charts, first = surface.charts, int(surface.charts.first[chart])
-    inner, seen, share = (charts.image(x, chart) for x in (field.inner, field.seen, surface.share))
+    charts, first = field.surface.charts, int(field.surface.charts.first[chart])
+    inner, seen, share = (charts.image(x, chart) for x in (field.inner, field.seen, field.surface.share))
     number = charts.image(count, chart)
     on = (inner > 0.0) & (seen > 0.0)
     if on.sum() < FEWEST_RING:
@@ -132,10 +132,10 @@ def _placed(mask: Bools, box: tuple[slice, ...], shape: tuple[int, ...]) -> Bool
     return whole
 
 
-def _hole(field: Field, surface: DesignSurface, count: Floats, chart: int, cells: Ints, ring: Ints) -> _Hole | None:
+def _hole(field: Field, count: Floats, chart: int, cells: Ints, ring: Ints) -> _Hole | None:
     """Return an empty place with the points expected there; None for a strip along a border of its face."""
-    core = cells[field.inner[cells] > 0.0]
-    at_border, beside = _at_border(field, surface, chart, cells)
+    surface, core = field.surface, cells[field.inner[cells] > 0.0]
+    at_border, beside = _at_border(field, chart, cells)
     if not len(at_border):
         if not len(core):
             return None
@@ -156,16 +156,16 @@ def _hole(field: Field, surface: DesignSurface, count: Floats, chart: int, cells
         bitten=len(at_border) > 0,
         expected=expected,
         counted=float(count[examined].sum()),
-        spread=_spread(field, surface, count, chart),
+        spread=_spread(field, count, chart),
     )
 
 
-def _at_border(field: Field, surface: DesignSurface, chart: int, cells: Ints) -> tuple[Ints, Ints]:
+def _at_border(field: Field, chart: int, cells: Ints) -> tuple[Ints, Ints]:
     """Return those of a place's ``cells`` (n,) at a border of its face, and the cells along that border about them.
 
     None where the border does not go on at both ends: at a corner, or where the cloud ends.
     """
-    none = np.empty(0, np.int64)
+    surface, none = field.surface, np.empty(0, np.int64)
     first, shape = int(surface.charts.first[chart]), surface.charts.shape[chart]
     i, j = np.divmod(cells - first, shape[1])
     start = np.maximum([i.min() - RING_CELLS, j.min() - RING_CELLS], 0)
@@ -182,9 +182,9 @@ def _at_border(field: Field, surface: DesignSurface, chart: int, cells: Ints) ->
     return rows[mask & border], rows[about]
 
 
-def _spread(field: Field, surface: DesignSurface, count: Floats, chart: int) -> float:
+def _spread(field: Field, count: Floats, chart: int) -> float:
     """Return the variance of numbers of points by their mean, from cells side by side; at least 1 (Poisson)."""
-    charts = surface.charts
+    charts = field.surface.charts
     number, seen = charts.image(count, chart), charts.image(field.seen, chart) > 0.0
     square = [
         (a[both] - b[both]) ** 2 / np.maximum(a[both] + b[both], 1.0)
@@ -225,7 +225,7 @@ def _directions(surface: DesignSurface, cell: int) -> Floats:
     k = np.arange(DIRECTIONS) + 0.5
     height = 1.0 - k / DIRECTIONS * (1.0 - LEAST_COS)
     turn = np.pi * (1.0 + np.sqrt(5.0)) * k
-    axes = surface.charts.axes[chart_of_cells(surface)[cell]]
+    axes = surface.charts.axes[surface.chart[cell]]
     across = np.sqrt(1.0 - height**2)
     spread: Floats = np.stack([across * np.cos(turn), across * np.sin(turn), height], axis=1) @ axes
     return spread

@@ -15,7 +15,7 @@ import numpy as np
 from processor.defects.deviation_field import Field
 from processor.defects.observations import Observed, cells_of
 from processor.defects.regions import EMPTY_SHARE, Region, chernoff
-from processor.defects.surface_charts import PLANE, DesignSurface, chart_of_cells
+from processor.defects.surface_charts import PLANE, DesignSurface
 from processor.geometry import mesh_bodies, mesh_distance, rigid
 from processor.large_arrays import blocks
 from processor.model import Bools, Floats, Ints
@@ -39,39 +39,35 @@ class _Contact:
     is_empty: bool
 
 
-def of_bodies(
-    observed: Observed, field: Field, surface: DesignSurface, hidden: Bools, alarms_per_mm2: float
-) -> list[Region]:
-    """Return the faces of bodies that are gone. ``hidden`` (cells, samples) are places that other bodies hide."""
-    body = mesh_bodies.closed_bodies(surface.faces)
-    contacts = list(_contacts(observed, field, surface, hidden, body))
+def of_bodies(observed: Observed, field: Field, alarms_per_mm2: float) -> list[Region]:
+    """Return the faces of bodies that are gone."""
+    body = mesh_bodies.closed_bodies(field.surface.faces)
+    contacts = list(_contacts(observed, field, body))
     present = [contact for contact in contacts if not contact.is_empty]
     if not present:
         return []
     rates = [contact.points / contact.area for contact in present]
     # By error, on 1 mm2; points on the contact of a body that is gone also count for the one that it stood on.
     rate = max(float(np.median(rates)), 1.0 / sum(contact.area for contact in present))
-    least = EMPTY_SHARE * _density(field, surface)
+    least = EMPTY_SHARE * _density(field)
     regions: list[Region] = []
     for contact in contacts:
         if not contact.is_empty or contact.points < least * contact.area:
             continue
         strength = chernoff(rate * contact.area, float(contact.points), more=True)
         if strength > -np.log(alarms_per_mm2 * contact.area):
-            regions += _faces(surface, hidden, body, contact.body, strength)
+            regions += _faces(field.surface, body, contact.body, strength)
     return regions
 
 
-def _contacts(
-    observed: Observed, field: Field, surface: DesignSurface, hidden: Bools, body: Ints
-) -> Iterator[_Contact]:
+def _contacts(observed: Observed, field: Field, body: Ints) -> Iterator[_Contact]:
     """Yield the contacts of each closed body that has any."""
-    charts = surface.charts
-    touched = np.flatnonzero(hidden.any(axis=1) & (charts.kind == PLANE)[chart_of_cells(surface)])
+    surface, charts = field.surface, field.surface.charts
+    touched = np.flatnonzero(surface.hidden.any(axis=1) & (charts.kind == PLANE)[surface.chart])
     places, inward, place_mm2 = _places_of(surface, touched)
     found = _points_on(observed, surface, touched)
     low, high = mesh_bodies.boxes(surface.vertices[surface.faces], body).swapaxes(0, 1)
-    typical = _density(field, surface) * charts.cell_mm**2
+    typical = _density(field) * charts.cell_mm**2
     for one in range(len(low)):
         only = np.where(body == one, 0, -1)
 
@@ -88,10 +84,10 @@ def _contacts(
             yield _Contact(one, samples * place_mm2, number(*found), empty)
 
 
-def _density(field: Field, surface: DesignSurface) -> float:
+def _density(field: Field) -> float:
     """Return the median number of points on 1 mm2 of the faces that were seen; 0 if none were."""
     seen = field.seen > 0.0
-    return float(np.median(field.count[seen])) / surface.charts.cell_mm**2 if seen.any() else 0.0
+    return float(np.median(field.count[seen])) / field.surface.charts.cell_mm**2 if seen.any() else 0.0
 
 
 def _well_inside(points: Floats, normals: Floats, grid: mesh_distance.FacetGrid, only: Ints) -> Bools:
@@ -117,7 +113,7 @@ def _places_of(surface: DesignSurface, cells: Ints) -> tuple[Floats, Floats, flo
     charts = surface.charts
     side = int(np.ceil(charts.cell_mm / STEP_MM))
     offset = charts.cell_mm * ((np.indices((side, side)).reshape(2, -1).T + 0.5) / side - 0.5)
-    axes = charts.axes[chart_of_cells(surface)[cells]]
+    axes = charts.axes[surface.chart[cells]]
     places = surface.centres[cells][:, None] + np.einsum("ok,nkj->noj", offset, axes[:, :2])
     return places.reshape(-1, 3), np.repeat(axes[:, 2], side * side, axis=0), (charts.cell_mm / side) ** 2
 
@@ -140,15 +136,15 @@ def _cells_of_body(surface: DesignSurface, body: Ints, one: int) -> Ints:
     """Return the cells of the faces that are of one body alone."""
     charts = np.unique(surface.chart_of[body == one])
     charts = np.setdiff1d(charts, surface.chart_of[body != one])
-    return np.flatnonzero(np.isin(chart_of_cells(surface), charts))
+    return np.flatnonzero(np.isin(surface.chart, charts))
 
 
-def _faces(surface: DesignSurface, hidden: Bools, body: Ints, one: int, strength: float) -> Iterator[Region]:
+def _faces(surface: DesignSurface, body: Ints, one: int, strength: float) -> Iterator[Region]:
     """Yield the cells of each face of a body that could be seen, as missing."""
     cells = _cells_of_body(surface, body, one)
-    cells = cells[(surface.covered & ~hidden)[cells].mean(axis=1) > 0.5 * surface.share[cells]]
+    cells = cells[(surface.covered & ~surface.hidden)[cells].mean(axis=1) > 0.5 * surface.share[cells]]
     cells = cells[surface.share[cells] > 0.0]
-    chart = chart_of_cells(surface)[cells]
+    chart = surface.chart[cells]
     chance = float(np.exp(-strength)) / surface.charts.cell_mm**2
     for number in np.unique(chart):
         yield Region(int(number), cells[chart == number], 0, float(np.sqrt(2.0 * strength)), chance)

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from processor.components import bridge_parts
 from processor.components.bridge_parts import PartScene
-from processor.defects.design_pose import Measured
 from processor.defects.result import Defects, PartPoses, Picture, Result, SurfacePlaces, Windows
 from processor.defects.verdicts import depths_and_areas
 from processor.limits.judging import JudgedLimits
-from processor.model import Reason, Scene, Status, reason
+from processor.model import Scene, Status
 
 
 def defects(
@@ -29,14 +29,10 @@ def defects(
     Poses are those of the parts, in the table ``parts``; defects are numbered over all parts.
     """
     results = [_of_part(part, method, deviation, one) for part in parts]
-    failed = [result.status is Status.FAILED for result in results]
-    status = Status.FAILED if all(failed) else Status.PARTIAL if any(failed) else Status.OK
     known = [result for result in results if result.status is not Status.FAILED]
-    reasons = (reason("parts.each-at-its-best-fit"), *_doubts(parts, results))
+    status, reasons = bridge_parts.together(parts, results)
     if not known:
         return Result(status=status, method=method, reasons=reasons, parts=_table(parts, results))
-    if status is Status.OK and any(result.status is not Status.OK for result in known):
-        status = Status.WEAK
     found = list(_numbered(known))
     return Result(
         status=status,
@@ -73,21 +69,8 @@ def _pose(name: str, deviation: Any) -> dict[str, Any]:
     row = table.name.index(name)
     if not np.isfinite(table.T_design_scan[row]).all():
         return {}
-    return {
-        "deviation": Measured(
-            status=table.status[row],
-            reasons=table.reasons[row],
-            T_design_scan=table.T_design_scan[row],
-            registration=table.registration[row],
-            registration_error=float(table.registration_error[row]),
-        )
-    }
-
-
-def _doubts(parts: Sequence[PartScene], results: Sequence[Result]) -> Iterator[Reason]:
-    for part, result in zip(parts, results, strict=True):
-        if result.status is not Status.OK and result.reasons:
-            yield reason("parts.of-part", part=part.name, why=result.reasons[:1])
+    of_part = {name: getattr(table, name)[row] for name in ("status", "reasons", "T_design_scan", "registration")}
+    return {"deviation": replace(deviation, **of_part, registration_error=float(table.registration_error[row]))}
 
 
 def _numbered(results: Sequence[Result]) -> Iterator[Result]:

@@ -6,19 +6,18 @@ import numpy as np
 
 from processor.defects.component_deviations import FEWEST_SEEN, LEAST_Z
 from processor.defects.deviation_field import Field
-from processor.defects.surface_charts import DesignSurface
 from processor.model import Floats
 
 
-def unproven(field: Field, surface: DesignSurface) -> Floats:
+def unproven(field: Field) -> Floats:
     """Return the median deviation of each face, for all of its cells (cells,), where it is not significant; else 0.
 
     A face that one station saw alone deviates by that station's error. A search that does not leave it out finds the
     whole face in place of what deviates from the rest of it.
     """
-    offsets = np.zeros(len(surface.share))
-    for chart in range(len(surface.charts.kind)):
-        rows = surface.charts.cells(chart)
+    charts, offsets = field.surface.charts, np.zeros(len(field.deviation))
+    for chart in range(len(charts.kind)):
+        rows = charts.cells(chart)
         seen = np.flatnonzero(field.seen[rows] > 0.0) + rows.start
         if len(seen) >= FEWEST_SEEN:
             median = float(np.median(field.deviation[seen]))

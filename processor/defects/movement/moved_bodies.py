@@ -13,11 +13,11 @@ import numpy as np
 
 from processor.defects import component_deviations
 from processor.defects.component_deviations import ComponentShape, SignificantShape
-from processor.defects.shape_models import RIGID, Shape
+from processor.defects.shape_models import RIGID
 from processor.defects.surface_charts import DesignSurface
 from processor.defects.to_result import Search
 from processor.geometry import rigid
-from processor.model import DesignBodies, Floats, StructureDesign
+from processor.model import DesignBodies, StructureDesign
 
 LEAST_MM = 1.0  # movement from which on the design is changed: less is within a cell's own scatter of faces
 OTHERS_SHARE = 0.25  # of the movement, up to which other shapes of a component may be of its fit
@@ -46,18 +46,11 @@ def design(
     vertices = surface.vertices.copy()
     for number, (fit, judged) in movements.items():
         rows = np.unique(surface.faces[surface.component_of == number])
-        vertices[rows] = _at(judged.shape, fit, surface.vertices[rows])
+        # The factors of the shape are of its frame, those of the turn in units of the largest half size.
+        frame, shift, turn = fit.frame, judged.shape.factors[:3], judged.shape.factors[3:]
+        R = rigid.rotation_from_vector(turn / float(frame.half.max()) @ frame.axes)
+        vertices[rows] = (surface.vertices[rows] - frame.origin) @ R.T + (frame.origin + shift @ frame.axes)
     return StructureDesign(name, vertices, surface.faces, DesignBodies(surface.names, surface.component_of))
-
-
-def _at(shape: Shape, fit: ComponentShape, points: Floats) -> Floats:
-    """Return points (n, 3) of a component after its movement, which has the factors of a shape in its frame."""
-    frame = fit.frame
-    span = float(frame.half.max())
-    R = rigid.rotation_from_vector(shape.factors[3:] / span @ frame.axes)
-    middle: Floats = frame.origin + shape.factors[:3] @ frame.axes
-    after: Floats = (points - frame.origin) @ R.T + middle
-    return after
 
 
 def together(before: dict[int, tuple[ComponentShape, SignificantShape]], search: Search) -> Search:
@@ -68,7 +61,7 @@ def together(before: dict[int, tuple[ComponentShape, SignificantShape]], search:
         own = fits.setdefault(number, fit)
         rest = [shape for shape in own.fitted.shapes if shape.kind == RIGID and own is not fit]
         shape = dataclasses.replace(judged.shape, factors=sum((one.factors for one in rest), judged.shape.factors))
-        whole = component_deviations.judged(own, shape, search.surface, search.field, search.alignment, search.levels)
+        whole = component_deviations.judged(own, shape, search.field, search.levels)
         others = [one for one in total.get(number, []) if one.shape.kind != RIGID]
         total[number] = [dataclasses.replace(whole, chance=judged.chance, margin=judged.margin), *others]
     return dataclasses.replace(search, shapes=[fits[number] for number in sorted(fits)], significant=total)

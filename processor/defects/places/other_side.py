@@ -22,13 +22,13 @@ FORM_SHARE = 0.25  # of the depth, by which the two sides of a dent may differ i
 MOST_EVIDENCE = 20.0  # of the logarithm of a ratio of likelihoods
 
 
-def stayed(field: Field, surface: DesignSurface, cells: Ints) -> float:
+def stayed(field: Field, cells: Ints) -> float:
     """Return the probability that the other side of a plate did not move with ``cells`` (n,); NaN if it was not seen.
 
     Either it stayed, or it moved by as much; both are as likely beforehand.
     """
     cells = cells[field.seen[cells] > 0.0]
-    other = cells_opposite(surface, cells)
+    other = cells_opposite(field.surface, cells)
     known = (other >= 0) & (field.seen[other] > 0.0)
     if not len(cells) or known.mean() < LEAST_SHARE:
         return float("nan")
