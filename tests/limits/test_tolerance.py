@@ -42,9 +42,7 @@ def test_every_limit_has_a_meaning_source_and_measure():
                 row.key
             )
             assert bool(row.of) == (not all(map(math.isnan, (row.high_ratio, row.above_mm, row.up_to_mm))))
-            low, high = limit_bounds.bounds(
-                row, dict.fromkeys(LIMITED_SIZES, 1000.0)
-            )
+            low, high = limit_bounds.bounds(row, dict.fromkeys(LIMITED_SIZES, 1000.0))
             assert low < high < math.inf
             assert not (row.verified and not row.clause), "a verified row has its clause"
 
