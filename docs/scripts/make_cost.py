@@ -56,7 +56,7 @@ def tables(content: dict[str, Any]) -> list[str]:
     for key, name in (("points", "points"), ("step", "step, processor s"), ("cpu", "run, processor s"), ("mb", "MB")):
         lines.append(f"| {name} | " + " | ".join(figure(one[key]) for one in content["start"].values()) + " |")
     heads = (
-        "step", "against", "held", "size", "points", "step, processor s", "run, processor s", "run, s", "MB",
+        "step", "against", "held", "size", "points", "step, processor s", "run, processor s", "MB",
         "exponent of the step's s", "of MB", "bytes a point",
     )  # fmt: skip
     lines += ["", "| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
@@ -68,7 +68,7 @@ def tables(content: dict[str, Any]) -> list[str]:
 
 def series_row(series: dict[str, Any]) -> str:
     """One row: the values of all sizes with slashes between."""
-    keys = ("size", "points", "step", "cpu", "wall", "mb")
+    keys = ("size", "points", "step", "cpu", "mb")
     columns = ["/".join(figure(row[key]) for row in series["rows"]) for key in keys]
     if series["over"] == "points":
         columns[1] = ""
