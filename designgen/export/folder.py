@@ -118,6 +118,8 @@ def _write(
         lines.append(f"design = {as_toml(design)}")
     if np.isfinite(scene.temperature_C):
         lines.append(f"temperature_C = {scene.temperature_C!r}")
+    if scene.steel is not None:
+        lines += ["", "[steel]", f"E_MPa = {scene.steel.E_MPa!r}", f"density_kg_m3 = {scene.steel.density_kg_m3!r}"]
     named = list(zip(project.stems(scan.name for scan in scene.scans), scene.scans, strict=True))
     written = formats.write_all(folder / "scans", format_, named, scene.stations, labels, spherical=spherical)
     if labels and format_ in formats.LABELLED:

@@ -17,7 +17,7 @@ from designgen.randomness import generator
 from designgen.rigid import rigid
 from designgen.scanning import clutter
 from designgen.scanning.surfaces import Builder
-from processor.model import Floats
+from processor.model import Floats, Steel
 
 KINDS = ("workshop", "site", "room")
 ABOVE_FLOOR_MM = 800.0  # height of a part on trestles
@@ -25,6 +25,8 @@ HIGHEST_TRESTLE_MM = 2_000.0  # chosen: parts lie on some 0.8 m; what stands hig
 SCANNER_MM = 400.0  # least height of a scanner above the floor: on a low tripod, which sees below the part
 CLEAR_MM = 1_500.0  # chosen: from a scanner to a person; at 0.5 m he hides an eighth of the turn
 ALBEDO = {"floor": 0.7, "wall": 1.3, "wood": 0.9}  # by the structure's: dusty concrete, paint, boards
+# Of parts on trestles: what is scanned is not bent by its weight, so by this modulus no sag is taken out of it either.
+RIGID = Steel(E_MPa=1e12)
 FLAT = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 Local = Floats | Sequence[float]  # (3,) in the axes of a box
@@ -38,6 +40,11 @@ class Params:
 
     def __post_init__(self) -> None:
         expect(self.kind in KINDS, "surroundings.kind", self.kind, f"one of {', '.join(KINDS)}")
+
+    @property
+    def steel(self) -> Steel | None:
+        """Steel of parts scanned in them, where it is not that of every structure."""
+        return RIGID if self.kind == "workshop" else None
 
 
 @dataclass(frozen=True)

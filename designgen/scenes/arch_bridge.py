@@ -74,6 +74,7 @@ def _made(
         arch=_design(parts, closed=closed),
         stations=stations,
         temperature_C=imperfections.stated(errors.temperature_C),
+        steel=scanning.surroundings.steel if isinstance(scanning, ByRays) and scanning.surroundings else None,
     )
     edges = np.array([_bottom_edges(part) for part in built])
     return scene, Truth(

@@ -57,7 +57,14 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
             displaced = corners + part.displacement(corners)
             ends.append((number, end.joint, end.outward, displaced @ T[:3, :3].T + T[:3, 3], displaced))
     stations, station_truth = apart.stations()
-    scene = Scene(name, "arch-bridge", tuple(apart.scans), arch=_design(nominal), stations=stations)
+    scene = Scene(
+        name,
+        "arch-bridge",
+        tuple(apart.scans),
+        arch=_design(nominal),
+        stations=stations,
+        steel=scanning.surroundings.steel if isinstance(scanning, ByRays) and scanning.surroundings else None,
+    )
     return scene, Truth(
         tuple(apart.labels),
         arch=_truth(nominal, names, poses, ends),

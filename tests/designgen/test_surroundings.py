@@ -7,7 +7,11 @@ import numpy as np
 import pytest
 
 import designgen
+from designgen.export import folder as export_folder
 from processor.model import UsageError
+from processor.preassembly.parts import bending
+from processor.scan_folder import folder
+from processor.store import store
 
 ROUGH = {"scan.step_mrad": 30.0, "scan.clutter": 0}
 FRAME_OF_FOUR = Path(__file__).resolve().parents[2] / "fixtures" / "frame-of-four.toml"
@@ -42,6 +46,19 @@ def test_a_part_stands_among_what_a_day_has(kind):
     # Its stations see it from above the floor alone, and something stands before it.
     assert 0.2 * len(alone) < of_part.sum() < 1.5 * len(alone)
     assert np.ptp(points, axis=0).max() > 1.5 * np.ptp(alone, axis=0).max()
+
+
+def test_no_sag_is_computed_of_parts_that_lie_on_trestles_without_bending(tmp_path):
+    scene, truth = designgen.make("arch-s1-rays", seed=3, settings=ROUGH | {"surroundings.kind": "workshop"})
+    store.write_scene(tmp_path / "s.h5", scene, truth, {})
+    export_folder.export(tmp_path / "s.h5", tmp_path / "out", "ply", with_truth=False)
+    back = folder.read_input(tmp_path / "out")
+    beam = bending.beam(back.arch.parts[1], back.arch.parts[1].bottom_edge_left[0], back.steel)
+    sag, _ = bending.sag(beam, np.array([0.0, 0.0, -1.0]), (0.2 * beam.length, 0.8 * beam.length))
+    assert (
+        np.abs(sag.across).max() < 1e-6
+    )  # less than 1 mm with a modulus of 210,000 MPa, which is 5 million times less
+    assert designgen.make("arch-s1", settings={"scan.spacing_mm": 400.0})[0].steel is None
 
 
 def test_trestles_touch_the_part_in_a_levelled_scan():
