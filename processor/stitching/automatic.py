@@ -11,7 +11,7 @@ import numpy as np
 
 from processor.adjustment import scanner_class_errors
 from processor.geometry import rigid, thread_ranges
-from processor.model import Control, Floats, Scan, reason
+from processor.model import Control, Floats, Reason, Scan, reason
 from processor.stitching import three_point
 from processor.stitching.coarse import network, pairwise
 from processor.stitching.coarse.pairwise import ScanPatches, ScoredPose
@@ -107,12 +107,11 @@ def stitch(
 
 def _stated(pair: Pair, candidates: list[ScoredPose], adjusted: ScoredPose, b: ScanPatches) -> Pair:
     """Return a pair with its overlap at the adjusted pose, and why it is not used, or what its best candidate says."""
+    why: tuple[Reason, ...] = ()
     if pair.is_gross:
         why = (reason("stitch.pair-contradicts"),)
     elif not candidates or not pairwise.same(candidates[0].T_a_b, adjusted.T_a_b, b.side_mm, b):
         why = (reason("stitch.pair-elsewhere"),)
-    else:
-        why = ()
     return replace(pair, overlap=adjusted.overlap, used=not pair.is_gross, reasons=why)
 
 
