@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,23 +11,13 @@ import numpy as np
 
 from designgen.export import formats, step_files
 from designgen.export.formats import Written
-from processor.model import (
-    Picks,
-    PointLabels,
-    Scan,
-    Scene,
-    UsageError,
-    per_point_fields,
-)
-from processor.plain_text import spreadsheet_text
+from processor.model import PointLabels, Scene, UsageError, per_point_fields
 from processor.store import store
 from processor.store.whole_output import check_new, whole_folder
 from processor.writers import project
-from processor.writers.cloud import METRES
 from processor.writers.toml import as_toml
 
 LABELS = "labels.json"  # names of the parts and surfaces by the numbers in the scans' files
-PICKS, PICK_COLUMNS = "picks.csv", ("scan_a", "scan_b", "point", "xa", "ya", "za", "xb", "yb", "zb")
 FEWEST_POINTS = 4  # of a scan that a reader accepts
 
 
@@ -110,12 +99,7 @@ def _write(
     with_meshes: bool,
 ) -> list[Written]:
     (folder / "scans").mkdir()
-    lines = [f"name = {as_toml(scene.name)}", f"kind = {as_toml(scene.kind)}"]
-    lines.append(f'units = "{"mm" if format_ == "ply" else "m"}"')
-    scale = 1.0 if format_ == "ply" else METRES
-    design = project.write_design(scene, folder, scale, with_meshes=with_meshes)
-    if design:
-        lines.append(f"design = {as_toml(design)}")
+    scale, lines = project.scale_of(format_), project.head_lines(scene, folder, format_, with_meshes=with_meshes)
     if np.isfinite(scene.temperature_C):
         lines.append(f"temperature_C = {scene.temperature_C!r}")
     if scene.steel is not None:
@@ -128,35 +112,15 @@ def _write(
     for file in written:
         lines += ["", "[[scan]]", f"file = {as_toml(f'scans/{file.name}')}"]
         if len(file.scans) > 1:
-            lines += _of_file(file.scans)
+            lines += project.common_lines(file.scans)
         else:
             (scan,) = file.scans
             with_pose = format_ == "ptx" or (format_ == "e57" and scan.T_project_scan.size > 0)
             lines += project.scan_lines(scan, scale, with_pose=with_pose)
     if scene.stations is not None and any(len(scan.point_station) for scan in scene.scans):
-        places = {
-            name: {"position": (position * scale).tolist()}
-            for name, position in zip(scene.stations.ids, scene.stations.positions, strict=True)
-        }
-        project.write_json(folder / "stations.json", places)
+        project.write_stations(folder / "stations.json", scene.stations, scale)
     if scene.picks is not None:
-        names = {scan.name: name for file in written for name, scan, _ in file.read_as}
-        _write_picks(folder / PICKS, scene.picks, names, scale)
+        read_as = {scan.name: (name, scale) for file in written for name, scan, _ in file.read_as}
+        project.write_picks(folder / "picks.csv", scene.picks, read_as)
     (folder / "project.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return written
-
-
-def _write_picks(path: Path, picks: Picks, names: Mapping[str, str], scale: float) -> None:
-    """Write the picked points between scans in ``names`` (names in the folder by scan), coordinates times ``scale``."""
-    with path.open("w", encoding="utf-8", newline="") as file:
-        rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(PICK_COLUMNS)
-        for a, b, point, *at in zip(picks.scan_a, picks.scan_b, picks.points, picks.in_a, picks.in_b, strict=True):
-            if a in names and b in names:
-                rows.writerow([names[a], names[b], spreadsheet_text(point), *(np.concatenate(at) * scale).tolist()])
-
-
-def _of_file(scans: Sequence[Scan]) -> list[str]:
-    """Return the lines of project.toml about a file with several scans: what is the same for all of them."""
-    sigmas = {scan.sigma_mm for scan in scans}
-    return [f"sigma_mm = {min(sigmas)!r}"] if len(sigmas) == 1 and np.isfinite(min(sigmas)) else []

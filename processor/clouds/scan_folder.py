@@ -12,14 +12,12 @@ import numpy as np
 from processor.clouds import exported_clouds
 from processor.clouds.earlier_run import Run
 from processor.clouds.poses import Placed
-from processor.model import Control, Floats, Picks, Tolerance
+from processor.model import Control, Tolerance
 from processor.plain_text import spreadsheet_text
-from processor.scan_folder import picks as picks_table
 from processor.scan_folder.control_points import COLUMNS
 from processor.scan_folder.files import CONTROL, PICKS, PROJECT, STATIONS
 from processor.scan_folder.tolerance import AGREED
 from processor.writers import project
-from processor.writers.cloud import METRES
 from processor.writers.toml import as_toml
 
 NO_POSE = np.empty(0)
@@ -28,12 +26,8 @@ EACH_SCAN = ("registered", "clean")  # contents with a file per scan, in the sca
 
 def write(folder: Path, run: Run, scans: Sequence[Placed], files: Sequence[str], what: str, format_: str) -> None:
     """Write what `processor run` needs beside the ``files`` of ``scans`` in a folder."""
-    scene, scale = run.scene, 1.0 if format_ == "ply" else METRES
-    lines = [f"name = {as_toml(scene.name)}", f"kind = {as_toml(scene.kind)}"]
-    lines.append(f'units = "{"mm" if format_ == "ply" else "m"}"')
-    design = project.write_design(scene, folder, scale, with_meshes=True)
-    if design:
-        lines.append(f"design = {as_toml(design)}")
+    scene, scale = run.scene, project.scale_of(format_)
+    lines = project.head_lines(scene, folder, format_)
     if scene.frame is not None and scene.frame.coordinates:
         lines.append(f"design_frame = {as_toml(scene.frame.coordinates)}")
     if np.isfinite(scene.temperature_C) and what != "assembled":  # the assembled parts have their reference lengths
@@ -43,14 +37,8 @@ def write(folder: Path, run: Run, scans: Sequence[Placed], files: Sequence[str],
         lines += _supports(run, scans, scale)
     if what == "merged":
         stations = exported_clouds.stations_of(run, scans)
-        # The noise of a merged cloud is stated where it is the same in all scans
-        sigmas = {one.scan.sigma_mm for one in scans}
-        lines += [
-            "",
-            "[[scan]]",
-            f"file = {as_toml(files[0])}",
-            *([f"sigma_mm = {min(sigmas)!r}"] if len(sigmas) == 1 and np.isfinite(min(sigmas)) else []),
-        ]
+        of_all = project.common_lines(one.scan for one in scans)
+        lines += ["", "[[scan]]", f"file = {as_toml(files[0])}", *of_all]
     else:
         stations = exported_clouds.stations_moved(run, scans)
         for one, file in zip(scans, files, strict=True):
@@ -69,13 +57,12 @@ def write(folder: Path, run: Run, scans: Sequence[Placed], files: Sequence[str],
             )
     (folder / PROJECT).write_text("\n".join(lines) + "\n", encoding="utf-8")
     if stations is not None:
-        places = zip(stations.ids, stations.positions, strict=True)
-        project.write_json(
-            folder / STATIONS, {name: {"position": (position * scale).tolist()} for name, position in places}
-        )
+        project.write_stations(folder / STATIONS, stations, scale)
     if what in EACH_SCAN:
         names = {one.number: Path(file).stem for one, file in zip(scans, files, strict=True)}
-        _write_picks(folder / PICKS, run, scans, names, scale)
+        if scene.picks is not None:
+            read_as = {one.scan.name: (names[one.number], one.scale * scale) for one in scans}
+            project.write_picks(folder / PICKS, scene.picks, read_as)
         _write_control(folder / CONTROL, scene.control, run, names, scale)
 
 
@@ -116,22 +103,6 @@ def _tolerance(tolerance: Tolerance | None) -> list[str]:
             agreed = by
     lines += [f"agreed_by = {as_toml(agreed)}"] if agreed else []
     return lines
-
-
-def _write_picks(path: Path, run: Run, scans: Sequence[Placed], names: dict[int, str], scale: float) -> None:
-    picks: Picks | None = run.scene.picks
-    if picks is None:
-        return
-    read_as = {one.scan.name: (names[one.number], one.scale * scale) for one in scans}
-    with path.open("w", encoding="utf-8", newline="") as file:
-        rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(picks_table.COLUMNS)
-        for a, b, point, at_a, at_b in zip(
-            picks.scan_a, picks.scan_b, picks.points, picks.in_a, picks.in_b, strict=True
-        ):
-            if a in read_as and b in read_as:
-                places: Floats = np.concatenate([at_a * read_as[a][1], at_b * read_as[b][1]])
-                rows.writerow([read_as[a][0], read_as[b][0], spreadsheet_text(point), *places.tolist()])
 
 
 def _write_control(path: Path, control: Control | None, run: Run, names: dict[int, str], scale: float) -> None:

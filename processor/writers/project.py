@@ -2,18 +2,61 @@
 
 from __future__ import annotations
 
+import csv
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from processor.model import KEY_POINTS, SUPPORTS, ArchDesign, FrameDesign, Scan, Scene
+from processor.model import KEY_POINTS, SUPPORTS, ArchDesign, FrameDesign, Picks, Scan, Scene, Stations
+from processor.plain_text import spreadsheet_text
+from processor.writers.cloud import METRES
 from processor.writers.ply import write_mesh
 from processor.writers.toml import as_toml
 
+PICK_COLUMNS = ("scan_a", "scan_b", "point", "xa", "ya", "za", "xb", "yb", "zb")
 LONGEST_STEM = 200  # bytes: with a suffix and a number less than the 255 that file systems take
+
+
+def scale_of(format_: str) -> float:
+    """Return the factor of coordinates in files of a format, of mm: PLY is in mm, all others are in metres."""
+    return 1.0 if format_ == "ply" else METRES
+
+
+def head_lines(scene: Scene, folder: Path, format_: str, *, with_meshes: bool = True) -> list[str]:
+    """Write the design, and return the lines of project.toml before those of scans in files of a format."""
+    lines = [f"name = {as_toml(scene.name)}", f"kind = {as_toml(scene.kind)}"]
+    lines.append(f'units = "{"mm" if format_ == "ply" else "m"}"')
+    design = write_design(scene, folder, scale_of(format_), with_meshes=with_meshes)
+    return [*lines, f"design = {as_toml(design)}"] if design else lines
+
+
+def common_lines(scans: Iterable[Scan]) -> list[str]:
+    """Return the lines of project.toml about a file with several scans: what is the same for all of them."""
+    sigmas = {scan.sigma_mm for scan in scans}
+    return [f"sigma_mm = {min(sigmas)!r}"] if len(sigmas) == 1 and np.isfinite(min(sigmas)) else []
+
+
+def write_stations(path: Path, stations: Stations, scale: float) -> None:
+    """Write where the stations are, coordinates times ``scale``."""
+    places = zip(stations.ids, stations.positions, strict=True)
+    write_json(path, {name: {"position": (position * scale).tolist()} for name, position in places})
+
+
+def write_picks(path: Path, picks: Picks, read_as: Mapping[str, tuple[str, float]]) -> None:
+    """Write the picked points between scans that are ``read_as`` a name in the folder, coordinates times a scale."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow(PICK_COLUMNS)
+        for a, b, point, in_a, in_b in zip(
+            picks.scan_a, picks.scan_b, picks.points, picks.in_a, picks.in_b, strict=True
+        ):
+            if a in read_as and b in read_as:
+                (name_a, scale_a), (name_b, scale_b) = read_as[a], read_as[b]
+                places = [*(in_a * scale_a).tolist(), *(in_b * scale_b).tolist()]
+                rows.writerow([name_a, name_b, spreadsheet_text(point), *places])
 
 
 def scan_lines(scan: Scan, scale: float, *, with_pose: bool) -> list[str]:
