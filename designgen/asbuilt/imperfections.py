@@ -148,13 +148,6 @@ class _Spot:
 
 
 @dataclass(frozen=True)
-class _Wave:
-    amplitude: float
-    phase: float
-    length: float
-
-
-@dataclass(frozen=True)
 class ArchErrors:
     """The errors of one part, mm and rad."""
 
@@ -162,7 +155,8 @@ class ArchErrors:
     twist: float
     bow: Floats  # (2,) sideways, upward
     section: Floats  # (2,) width, height
-    waves: dict[str, _Wave]  # by wall
+    waves: dict[str, tuple[float, float]]  # amplitude and phase by wall
+    wave_length: float
     dents: tuple[_Dent, ...] = ()
     corners: Floats = field(default_factory=lambda: np.zeros((2, 4, 3)))  # of P1 to P4 at each end: along, left, up
 
@@ -178,9 +172,9 @@ def fabricate(part: ArchPart, errors: ArchErrors, plates: Plates, holes: tuple[H
             flat = wall in ("bottom", "top")
             c, across = (u, u / b) if flat else (v, 2.0 * v / h - 1.0)
             near_end = np.clip(np.minimum(q, 1.0 - q) * span / 500.0, 0.0, 1.0)
-            wave = errors.waves[wall]
+            amplitude, phase = errors.waves[wall]
             window = np.maximum(1.0 - across**2, 0.0) * near_end**2
-            move = wave.amplitude * np.sin(2.0 * np.pi * s / wave.length + wave.phase) * window
+            move = amplitude * np.sin(2.0 * np.pi * s / errors.wave_length + phase) * window
             for dent in errors.dents:
                 if dent.wall == wall:
                     share = ((s - dent.s) ** 2 + (c - dent.c) ** 2) / dent.radius**2
@@ -277,11 +271,12 @@ def _draw_errors(
     _check_section(part, section)
     for plate, value in zip(("bottom plate", "top plate", "web plate"), thickness, strict=True):
         ledger.note(plate, part.name, value, "mm")
-    waves = {
-        wall: _Wave(float(amplitude), float(phase), params.waviness_length_mm)
-        for wall, amplitude, phase in zip(("bottom", "top", "left", "right"), amplitudes, phases, strict=True)
-    }
-    return ArchErrors(ends=ends, twist=twist, bow=bow, section=section, waves=waves, corners=corners), plates
+    waves = dict(zip(("bottom", "top", "left", "right"), zip(amplitudes, phases, strict=True), strict=True))
+    errors = ArchErrors(
+        ends=ends, twist=twist, bow=bow, section=section, waves=waves, wave_length=params.waviness_length_mm,
+        corners=corners,
+    )  # fmt: skip
+    return errors, plates
 
 
 def _sizes(part: ArchPart) -> tuple[float, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 from designgen.cad import faults, files
 from designgen.cad.bodies import Body, is_closed
 from designgen.models import cadquery_objects, mesh_bodies
-from designgen.models.model import Model, ModelBody, of_cad, unique_names, with_normals_reversed
+from designgen.models.model import Model, ModelBody, of_cad, unique_names
 from processor.meshes import mesh_files
 from processor.meshes.mesh_files import Piece
 from processor.model import Floats, InputError, Ints, UsageError
@@ -108,10 +109,12 @@ def _named(model: str, file: str, found: tuple[Sequence[Body | ModelBody], list[
     result, open_, inverted = [], [], []
     for body, name in zip(bodies, unique_names(names), strict=True):
         assert isinstance(body, Body)
-        inward = body.closed and faults.volume(body.vertices, body.faces) < 0.0
-        inverted += [name] if inward else []
         open_ += [] if body.closed else [name]
-        result.append(of_cad(with_normals_reversed(body) if inward else body, name))
+        if body.closed and faults.volume(body.vertices, body.faces) < 0.0:  # its triangles are wound the other way
+            inverted.append(name)
+            forms = body.forms and replace(body.forms, corner_uv=body.forms.corner_uv[:, ::-1])
+            body = replace(body, faces=body.faces[:, ::-1], forms=forms)
+        result.append(of_cad(body, name))
     notes += faults.of_shells(open_, inverted, "scanned as it is, from both sides")
     unnamed = len(faults.numbered(names, stem))
     return Model(model, tuple(result), tuple(notes), faults.shared_count(names), unnamed)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -101,12 +100,6 @@ def of_cad(body: Body, name: str) -> ModelBody:
         flat=flat,
         smooth=_smooth(body, [None if plane else surface for plane, surface in zip(flat, surfaces, strict=True)]),
     )
-
-
-def with_normals_reversed(body: Body) -> Body:
-    """Return a CAD body whose triangles are wound the other way, so that their normals are reversed."""
-    forms = body.forms and dataclasses.replace(body.forms, corner_uv=body.forms.corner_uv[:, ::-1])
-    return dataclasses.replace(body, faces=body.faces[:, ::-1], forms=forms)
 
 
 def of_mesh(name: str, vertices: Floats, triangles: Ints, most_deg: float = 20.0) -> ModelBody:

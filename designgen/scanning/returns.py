@@ -20,7 +20,7 @@ from designgen.randomness import generator
 from designgen.rigid import inverse
 from designgen.scanning import edge_footprints, ray_kernels, raycast
 from designgen.scanning.ray_kernels import Beam, Strip
-from designgen.scanning.raycast import Grid, View
+from designgen.scanning.raycast import Grid
 from designgen.scanning.scanner import BEAM_RINGS, Params, Scanner
 from designgen.scanning.surfaces import Surfaces
 from processor.model import SOURCES, Bools, Codes, Floats, Labels, Shorts
@@ -112,34 +112,8 @@ def scan_station(
     draws = generator(seed, f"station {station}").standard_normal(4)
     offset, scale = scanner.offset_mm * draws[0], scanner.scale_ppm * draws[1]
     tilt = 1e-6 * scanner.tilt_urad * draws[2:]
-    step = 1e-3 * params.step_mrad
-    grid = Grid(
-        step=step,
-        lowest=float(np.radians(LOWEST_DEG)),
-        rows=int(np.radians(HIGHEST_DEG - LOWEST_DEG) / step),
-        columns=max(8, round(2.0 * np.pi / step)),
-    )
-    T_scanner_scene = inverse(T_scene_scanner)
-    nearest = np.array([max(scanner.min_range_mm, 1.0)])
-    wide = float(scanner.beam_angle(nearest)[0]) * max(1.0, scanner.beam_aspect)
-    spread = 2.0 * wide + ENCODER_SIGMAS * 1e-6 * scanner.encoder_urad
-    least = max(float(nearest[0]), edge_footprints.nearest_mm(surfaces, T_scene_scanner[:3, 3]))
-    outermost = reach(scanner, params.sub_rays)
-    margin = edge_footprints.margin(grid, outermost.half_divergence + outermost.exit_radius / least)
-    caster = _StationCaster(
-        surfaces=surfaces,
-        view=raycast.view(surfaces, T_scanner_scene, grid, STRIP, margin.side, scanner.max_range_mm, spread),
-        T_scanner_scene=T_scanner_scene,
-        grid=grid,
-        scanner=scanner,
-        params=params,
-        seed=seed,
-        station=station,
-        keep_hits=keep_hits,
-        margin=margin,
-        outermost=outermost,
-        least=least,
-    )
+    caster = _StationCaster(surfaces, T_scene_scanner, scanner, params, seed, station, keep_hits)
+    grid = caster.grid
     threads = int(os.environ.get("OMP_NUM_THREADS") or os.cpu_count() or 1)
     with ThreadPoolExecutor(threads) as pool:  # the kernels release the interpreter's lock
         # One strip at least: it gives the columns of an empty scan their types.
@@ -176,22 +150,40 @@ def reach(scanner: Scanner, count: int) -> Beam:
     return Beam(widest * (0.5 * scanner.beam_waist_mm + half * scanner.beam_focus_mm), widest * half)
 
 
-@dataclass(frozen=True)
 class _StationCaster:
-    """Data of one station, and the steps from rays to returns for each strip."""
+    """Rays of one station, and the steps from them to returns for each strip; arguments as of :func:`scan_station`."""
 
-    surfaces: Surfaces
-    view: View
-    T_scanner_scene: Floats
-    grid: Grid
-    scanner: Scanner
-    params: Params
-    seed: int
-    station: str
-    keep_hits: bool
-    margin: edge_footprints.Margin
-    outermost: Beam  # in which all sub-rays lie
-    least: float  # lower bound of the range to any surface, mm
+    def __init__(
+        self,
+        surfaces: Surfaces,
+        T_scene_scanner: Floats,
+        scanner: Scanner,
+        params: Params,
+        seed: int,
+        station: str,
+        keep_hits: bool,
+    ) -> None:
+        self.surfaces, self.scanner, self.params = surfaces, scanner, params
+        self.seed, self.station, self.keep_hits = seed, station, keep_hits
+        step = 1e-3 * params.step_mrad
+        self.grid = Grid(
+            step=step,
+            lowest=float(np.radians(LOWEST_DEG)),
+            rows=int(np.radians(HIGHEST_DEG - LOWEST_DEG) / step),
+            columns=max(8, round(2.0 * np.pi / step)),
+        )
+        self.T_scanner_scene = inverse(T_scene_scanner)
+        nearest = np.array([max(scanner.min_range_mm, 1.0)])
+        wide = float(scanner.beam_angle(nearest)[0]) * max(1.0, scanner.beam_aspect)
+        spread = 2.0 * wide + ENCODER_SIGMAS * 1e-6 * scanner.encoder_urad
+        # Lower bound of the range to any surface, mm
+        self.least = max(float(nearest[0]), edge_footprints.nearest_mm(surfaces, T_scene_scanner[:3, 3]))
+        self.outermost = reach(scanner, params.sub_rays)  # in which all sub-rays lie
+        widest = self.outermost.half_divergence + self.outermost.exit_radius / self.least
+        self.margin = edge_footprints.margin(self.grid, widest)
+        self.view = raycast.view(
+            surfaces, self.T_scanner_scene, self.grid, STRIP, self.margin.side, scanner.max_range_mm, spread
+        )
 
     def in_view(self, number: int) -> bool:
         """Whether any column of a strip is in the scanner's field of view."""

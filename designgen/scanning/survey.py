@@ -162,27 +162,19 @@ def merged(
 
 
 def in_project(
-    surveyed: Survey, origin: Floats, merge: bool
-) -> tuple[tuple[Scan, ...], tuple[PointLabels, ...], Stations, StationTruth]:
-    """Return a survey in the project's frame, in which the scene has its ``origin`` (3,); ``merge``: as one cloud."""
-    T_project_scene = translation(origin)
-    registered = T_project_scene @ surveyed.registered
-    truth = dataclasses.replace(surveyed.truth, T_project_station=T_project_scene @ surveyed.truth.T_project_station)
-    stations = stations_of(surveyed.truth.ids, registered)
-    if merge:
+    surveyed: Survey, params: scanner.Params, *, registered: bool
+) -> tuple[tuple[Scan, ...], tuple[PointLabels, ...], Stations | None, StationTruth]:
+    """Return a survey in the project's frame, as one cloud if ``params.merged``; poses only if it is ``registered``."""
+    placed = moved(surveyed, translation(np.array(params.origin_mm)))
+    stations = stations_of(placed.truth.ids, placed.registered) if registered else None
+    if params.merged:
         scan, labels = merged(surveyed, "scan", np.eye(4), 0)
-        return (dataclasses.replace(scan, origin=origin),), (labels,), stations, truth
-    scans = [dataclasses.replace(scan, T_project_scan=T) for scan, T in zip(surveyed.scans, registered, strict=True)]
-    return tuple(scans), surveyed.labels, stations, truth
+        return (dataclasses.replace(scan, origin=np.array(params.origin_mm)),), (labels,), stations, placed.truth
+    poses = placed.registered if registered else [np.empty(0)] * len(placed.scans)
+    scans = [dataclasses.replace(scan, T_project_scan=T) for scan, T in zip(placed.scans, poses, strict=True)]
+    return tuple(scans), placed.labels, stations, placed.truth
 
 
 def stations_of(ids: tuple[str, ...], poses: Floats) -> Stations:
     """Return the stations of poses T_frame_station (k, 4, 4)."""
     return Stations(ids, poses[:, :3, 3], poses)
-
-
-def joined_truth(truths: Sequence[StationTruth]) -> StationTruth:
-    """Return the stations' truths of several surveys as one."""
-    columns = ("T_project_station", "zero_offset_mm", "scale_ppm", "tilt")
-    joined = {column: np.concatenate([getattr(truth, column) for truth in truths]) for column in columns}
-    return StationTruth(tuple(name for truth in truths for name in truth.ids), **joined)

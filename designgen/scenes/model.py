@@ -15,7 +15,7 @@ import numpy as np
 
 from designgen.designs import arch_bridge, arch_part
 from designgen.models import as_built, body_deviations, loading, station_placement
-from designgen.models.model import Model, ModelBody
+from designgen.models.model import Model
 from designgen.recipe_files import Recipe, overridden
 from designgen.recipe_params import filled
 from designgen.scanning import scanner as scanner_module
@@ -76,7 +76,9 @@ def make(
     if not isinstance(scanning, ByRays):
         raise UsageError('scan.mode: a model is scanned from stations; set scan.mode = "rays"')
     if model is None:
-        model = _part(section.part, recipe) if section.part else loading.load(Path(section.file), section.units)
+        part = part_solid(section.part, recipe) if section.part else None
+        file = Path(section.file)
+        model = loading.load(file, section.units) if part is None else loading.load(part, name=section.part)
     loading.log_notes(model)
     params, origin = scanning.params, np.array(scanning.params.origin_mm)
     names = tuple(body.name for body in model.bodies)
@@ -86,18 +88,19 @@ def make(
     else:
         distance = params.distance_mm if "distance_mm" in recipe.get("scan", {}) else None
         poses = station_placement.place_stations(model, math.prod(params.stations), distance, scanning.device, seed)
-    builder = _surfaces(built.bodies)
+    builder = Builder()
+    for number, body in enumerate(built.bodies):
+        for patch, smooth in body.patches() if body is not None else ():  # None: left out
+            builder.patch(number, patch, smooth)
     surroundings.add(builder, scanning.surroundings, surroundings.Box.about(model.mesh()[0]), poses, seed)
     surveyed = survey.survey(builder.to_surfaces(), names, poses, scanning.device, params, seed)
-    scans, labels, stations, station_truth = survey.in_project(surveyed, origin, params.merged)
-    if not params.registered:
-        scans = tuple(dataclasses.replace(scan, T_project_scan=np.empty(0)) for scan in scans)
+    scans, labels, stations, station_truth = survey.in_project(surveyed, params, registered=params.registered)
     vertices, faces = model.mesh()
     scene = Scene(
         name,
         "structure",
         scans,
-        stations=stations if params.registered else None,
+        stations=stations,
         structure=StructureDesign(model.name, vertices + origin, faces, model.design_bodies()),
     )
     return scene, Truth(
@@ -109,25 +112,11 @@ def make(
     )
 
 
-def _part(name: str, recipe: Mapping[str, Any]) -> Model:
-    """Return a part of an arch bridge, in the bridge's frame, as a model of one body with the part's name."""
-    return loading.load(part_solid(name, recipe), name=name)
-
-
 def part_solid(name: str, recipe: Mapping[str, Any]) -> cq.Assembly:
-    """Return the solid of a part of an arch bridge under its name; UsageError for a part that there is none of."""
+    """Return the solid of a part of an arch bridge, in the bridge's frame; UsageError for a part that it has not."""
     import cadquery as cq
 
     parts = {part.name: part for part in arch_bridge.build(filled(arch_bridge.Params, recipe, "bridge"))}
     if name not in parts:
         raise UsageError(f'model.part: expected one of {", ".join(parts)}, got "{name}"')
     return cq.Assembly(name="bridge").add(arch_part.solid(parts[name]), name=name)
-
-
-def _surfaces(built: Sequence[ModelBody | None]) -> Builder:
-    """Return the surfaces of bodies as built; None for one that is left out."""
-    builder = Builder()
-    for part, body in enumerate(built):
-        for patch, smooth in body.patches() if body is not None else ():
-            builder.patch(part, patch, smooth)
-    return builder

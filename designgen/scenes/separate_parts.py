@@ -62,5 +62,8 @@ class SeparateScans:
         """Return the stations of all parts, each in the frame of its part's scan, and their truth; None of samples."""
         if not self._surveys:
             return None, None
-        truth = survey.joined_truth([one.truth for one in self._surveys])
+        truths = [one.truth for one in self._surveys]
+        columns = ("T_project_station", "zero_offset_mm", "scale_ppm", "tilt")
+        joined = {column: np.concatenate([getattr(one, column) for one in truths]) for column in columns}
+        truth = StationTruth(tuple(name for one in truths for name in one.ids), **joined)
         return survey.stations_of(truth.ids, np.concatenate([one.registered for one in self._surveys])), truth

@@ -37,7 +37,7 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         poses = survey.stations_below_box(low, high, params, seed)
         surroundings.add(builder, scanning.surroundings, surroundings.Box.about(built.centres), poses, seed)
         surveyed = survey.survey(builder.to_surfaces(), names, poses, scanning.device, params, seed)
-        scans, labels, stations, station_truth = survey.in_project(surveyed, origin, params.merged)
+        scans, labels, stations, station_truth = survey.in_project(surveyed, params, registered=True)
     else:
         cloud = sampler.scan_frame(built, scanning, generator(seed, "scan"))
         scans = (Scan("scan", cloud.points, sigma_mm=scanning.sigma_mm),)

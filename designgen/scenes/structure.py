@@ -79,11 +79,8 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         surveyed = survey.survey(builder.to_surfaces(), names, poses, scanning.device, params, seed)
         if of_defects is not None:
             surveyed = _labelled(surveyed, of_defects)
-        scans, labels, stations, station_truth = survey.in_project(surveyed, origin, params.merged)
+        scans, labels, stations, station_truth = survey.in_project(surveyed, params, registered=params.registered)
         picks = _picks(recipe, scans, station_truth, params, corners + origin, seed)
-        if not params.registered:
-            scans = tuple(dataclasses.replace(scan, T_project_scan=np.empty(0)) for scan in scans)
-            stations = None
     else:
         if "picks" in recipe:
             raise UsageError('picks: points are picked in scans by rays; set scan.mode = "rays"')

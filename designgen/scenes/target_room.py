@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -92,13 +91,11 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         place, frame = _on_face(faces, 2.0 * room.checkerboard_mm, taken, of_decoys)
         _decoy(builder, DECOYS[i % len(DECOYS)], f"decoy {i + 1}", place, frame, room.checkerboard_mm)
     surveyed = survey.survey(builder.to_surfaces(), (), _stations(room, params, seed), scanning.device, params, seed)
-    scans, labels, stations, truth = survey.in_project(surveyed, np.array(params.origin_mm), params.merged)
+    scans, labels, stations, truth = survey.in_project(surveyed, params, registered=params.registered)
     positions = np.array(places).reshape(-1, 3) + np.array(params.origin_mm)
     known = positions + room.surveyed_mm * generator(seed, "survey of targets").standard_normal(positions.shape)
-    if not params.registered:
-        scans = tuple(dataclasses.replace(scan, T_project_scan=np.empty(0)) for scan in scans)
     scene = Scene(
-        name, "structure", scans, stations=stations if params.registered else None,
+        name, "structure", scans, stations=stations,
         control=Control(tuple(ids), positions=known, sd=np.full(len(ids), room.surveyed_mm)) if ids else None,
         target_search=TargetSearch(
             room.checkerboard_mm if room.checkerboards else np.nan, room.sphere_radius_mm if room.spheres else np.nan

@@ -13,13 +13,20 @@ from designgen.scanning import sampler
 from designgen.scenes.make import make
 from processor.model import UsageError
 
-NONE = {wall: imperfections._Wave(0.0, 0.0, 1000.0) for wall in ("bottom", "top", "left", "right")}
+NONE = dict.fromkeys(("bottom", "top", "left", "right"), (0.0, 0.0))
 RIB = arch_bridge.build(arch_bridge.Params())[2]
 ROUNDING_MM = 1e-9  # float64 at 60 m: 1e-11
 
 
 def built(**errors):
-    still = {"ends": np.zeros((2, 3)), "twist": 0.0, "bow": (0.0, 0.0), "section": (0.0, 0.0), "waves": NONE}
+    still = {
+        "ends": np.zeros((2, 3)),
+        "twist": 0.0,
+        "bow": (0.0, 0.0),
+        "section": (0.0, 0.0),
+        "waves": NONE,
+        "wave_length": 1e3,
+    }
     return imperfections.fabricate(RIB, imperfections.ArchErrors(**{**still, **errors}), RIB.plates)
 
 
@@ -133,7 +140,7 @@ def test_dents_waves_and_missing_pieces_are_at_the_places_of_the_truth():
     middle = owner.point(*(np.array([x]) for x in (middle[0], u, middle[1])))
     away = np.linalg.norm(cloud.points - middle, axis=1)
     assert 100.0 < away.min() < 130.0  # 125 to the edge; the plate's cut faces reach a little inward
-    waves = built(waves={wall: imperfections._Wave(1.5, 0.0, 1500.0) for wall in NONE})
+    waves = built(waves=dict.fromkeys(NONE, (1.5, 0.0)), wave_length=1500.0)
     p, q = np.random.default_rng(0).uniform(size=(2, 20_000))
     off = {
         f.name: f.at(p, q) - g.at(p, q)

@@ -607,10 +607,11 @@ def test_merged_scans_lie_where_the_stations_saw_them():
     poses = {"S1": standing(2500.0, 2800.0, 1600.0), "S2": standing(100.0, 400.0, 1500.0)}
     found = survey.survey(surfaces, (), poses, QUIET, scanner.Params(step_mrad=6.0, sub_rays=1), 5)
     origin = np.array([5.0e8, 4.3e9, 1.0e5])
-    (scan,), (labels,), stations, truth = survey.in_project(found, origin, merge=True)
+    one, each = (scanner.Params(origin_mm=tuple(origin), merged=merged) for merged in (True, False))
+    (scan,), (labels,), stations, truth = survey.in_project(found, one, registered=True)
     assert stations.ids == truth.ids == ("S1", "S2")
     np.testing.assert_allclose(stations.positions - origin, [T[:3, 3] for T in poses.values()], atol=EXACT_MM)
-    scans, _, _, _ = survey.in_project(found, origin, merge=False)
+    scans, _, _, _ = survey.in_project(found, each, registered=True)
     at = 0
     for k, single in enumerate(scans):
         own = scan.point_station == k
