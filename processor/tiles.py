@@ -12,6 +12,10 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
+import numpy as np
+
+from processor.model import Ints
+
 S = TypeVar("S")
 T = TypeVar("T")
 R = TypeVar("R")
@@ -56,6 +60,19 @@ def mapped(function: Callable[..., R], tiles: Iterable[Any], *shared: Shared[Any
             yield function(tile, *(one.value for one in shared))
     else:
         yield from workers.results(function, tiles, shared)
+
+
+def grouped(counts: Ints, most: int) -> Ints:
+    """Return the group (b,) of each of bins in a row, such that the ``counts`` (b,) of a group are ``most`` in sum.
+
+    A bin that has more is a group by itself.
+    """
+    group, number, total = np.empty(len(counts), np.int64), 0, 0
+    for row, count in enumerate(counts.tolist()):
+        if total and total + count > most:
+            number, total = number + 1, 0
+        group[row], total = number, total + count
+    return group
 
 
 def ranges(count: int, size: int) -> list[slice]:

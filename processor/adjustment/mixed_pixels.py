@@ -177,11 +177,7 @@ class _Bands(NamedTuple):
         filled = np.zeros(len(columns) - 1, np.int64)
         for part in blocks(count):
             filled += np.bincount(_rows(_directions(every.points[part], scanner), columns), minlength=len(filled))
-        band, total, band_of_row = 0, 0, np.empty(len(filled), np.int64)
-        for number, of_row in enumerate(filled.tolist()):
-            if total and total + of_row > BAND_POINTS:
-                band, total = band + 1, 0
-            band_of_row[number], total = band, total + of_row
+        band_of_row = tiles.grouped(filled, BAND_POINTS)
         ends = np.cumsum(np.bincount(band_of_row, filled)).astype(np.int64)
 
         def band_of(block: tuple[Array, ...]) -> Ints:

@@ -121,46 +121,17 @@ def scanner_of(run: Run, placed: Placed) -> Floats | None:
     return -placed.scale * scan.origin if single and len(run.points.column(placed.number, "grid_row")) else None
 
 
-@dataclass(frozen=True)
-class DesignSurfaces:
-    """Surfaces of a design, and how far from them points are of it, mm."""
+def _near(surface: MeshSurface, depth: float, T: Floats) -> OfDesign:
+    """Return the function that marks points within ``depth``, mm, of a surface where they are placed by T (4, 4)."""
 
-    surface: MeshSurface
-    depth: float
+    def of_design(points: Floats) -> Bools:
+        reach = depth + mesh_distance.DESIGN_SPACING_MM[1]  # to a sample of the surface
+        facet, distance, beyond = surface.distances(rigid.apply(T, points), reach)
+        with np.errstate(invalid="ignore"):
+            near: Bools = (facet >= 0) & (np.abs(distance) <= depth) & (beyond <= depth)
+        return near
 
-    def marks(self, T: Floats) -> OfDesign:
-        """Return the function that marks points placed by T (4, 4)."""
-
-        def of_design(points: Floats) -> Bools:
-            reach = self.depth + mesh_distance.DESIGN_SPACING_MM[1]  # to a sample of the surface
-            facet, distance, beyond = self.surface.distances(rigid.apply(T, points), reach)
-            with np.errstate(invalid="ignore"):
-                near: Bools = (facet >= 0) & (np.abs(distance) <= self.depth) & (beyond <= self.depth)
-            return near
-
-        return of_design
-
-
-def of_structure(run: Run) -> DesignSurfaces | None:
-    """Return the design's surfaces, less their local origin, and the depth to which step deviation compared with them.
-
-    None where it was not run, or has no pose.
-    """
-    result = run.steps.get("deviation")
-    if run.scene.structure is None or result is None or not result.T_design_scan.size:
-        return None
-    vertices, _ = scene_cloud.local_design(run.scene.structure)
-    depth = result.max_depth if np.isfinite(result.max_depth) else REACH_MM
-    return DesignSurfaces(mesh_distance.of_design(vertices, run.scene.structure.faces), depth)
-
-
-def of_part(run: Run, component: str) -> DesignSurfaces | None:
-    """Return the surfaces of a part in the bridge's frame; None without."""
-    parts = () if run.scene.arch is None else run.scene.arch.parts
-    part = next((part for part in parts if part.name == component), None)
-    if part is None or not len(part.faces):
-        return None
-    return DesignSurfaces(mesh_distance.of_mesh(part.vertices, part.faces), REACH_MM)
+    return of_design
 
 
 def filters(run: Run, scans: Sequence[Placed]) -> list[OfDesign | None]:
@@ -168,17 +139,23 @@ def filters(run: Run, scans: Sequence[Placed]) -> list[OfDesign | None]:
 
     None where the run does not tell: without a design with surfaces, or without a pose in it.
     """
-    structure = of_structure(run)
-    if structure is not None and run.scene.structure is not None:
-        origin = scene_cloud.local_design(run.scene.structure)[1]
-        T = run.steps["deviation"].T_design_scan
-        return [structure.marks(one.to_local(T @ one.T, origin)) for one in scans]
+    result, design = run.steps.get("deviation"), run.scene.structure
+    if design is not None and result is not None and result.T_design_scan.size:
+        vertices, origin = scene_cloud.local_design(design)
+        surface = mesh_distance.of_design(vertices, design.faces)
+        depth = result.max_depth if np.isfinite(result.max_depth) else REACH_MM
+        return [_near(surface, depth, one.to_local(result.T_design_scan @ one.T, origin)) for one in scans]
     if "preassemble" not in run.steps:
         return [None] * len(scans)
     in_bridge = {one.number: one for one in poses.in_bridge(run).scans}
+    parts = {} if run.scene.arch is None else {part.name: part for part in run.scene.arch.parts if len(part.faces)}
     marks: list[OfDesign | None] = []
     for one in scans:
-        part = in_bridge.get(one.number)
-        surfaces = None if part is None else of_part(run, part.component)
-        marks.append(None if part is None or surfaces is None else surfaces.marks(part.to_local(part.T, np.zeros(3))))
+        placed = in_bridge.get(one.number)
+        part = None if placed is None else parts.get(placed.component)
+        if placed is None or part is None:
+            marks.append(None)
+            continue
+        surface = mesh_distance.of_mesh(part.vertices, part.faces)
+        marks.append(_near(surface, REACH_MM, placed.to_local(placed.T, np.zeros(3))))
     return marks

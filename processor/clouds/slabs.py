@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from processor import tiles
 from processor.model import Floats
 from processor.writers.cloud import BLOCK, Block, Cloud
 from processor.writers.ply import records
@@ -66,13 +67,7 @@ def cut(cloud: Cloud, aside: Path, most: int = MOST) -> Slabs:
     filled = np.zeros(BINS, np.int64)
     for block in cloud.blocks():
         filled += np.histogram(block.points[:, axis], bins)[0]
-    inner: list[float] = []
-    total = 0
-    for number, points in enumerate(filled.tolist()):
-        if total and total + points > most:
-            inner.append(float(bins[number]))
-            total = 0
-        total += points
+    inner = bins[np.flatnonzero(np.diff(tiles.grouped(filled, most))) + 1]
     edges = np.array([-np.inf, *inner, np.inf])
     folder = Path(tempfile.mkdtemp(dir=aside))
     paths = tuple(folder / str(number) for number in range(len(edges) - 1))

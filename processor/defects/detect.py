@@ -37,7 +37,7 @@ from processor.defects.result import Result
 from processor.defects.surface_charts import DesignSurface
 from processor.geometry import mesh_distance, rigid
 from processor.large_arrays import every
-from processor.model import DesignBodies, Floats, InputError, Reason, Scene, Status, StructureDesign, reason
+from processor.model import DesignBodies, Floats, Reason, Scene, Status, StructureDesign, reason
 
 CELL_POINTS = 12.0  # in a cell, on the median
 CELL_BOUNDS_MM = (5.0, 60.0)  # below, a beam covers more than one; above, a dent of 100 mm less than two
@@ -61,10 +61,9 @@ class Registered:
 
 
 def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
-    """Find the defects of a structure against its design. Raises InputError without a design or without points."""
+    """Find the defects of a structure against its design. Raises InputError without points."""
     design = scene.structure
-    if design is None or not len(design.faces):
-        raise InputError(f"{scene.name}: defects need the structure's design (a mesh or STEP in project.toml)")
+    assert design is not None
     vertices, origin = scene_cloud.local_design(design)
     scene = scene_cloud.stitched(scene, earlier.get("stitch"))
     pose = design_pose.pose(scene, earlier, params)

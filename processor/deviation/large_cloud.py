@@ -122,11 +122,7 @@ class _Slabs:
         filled = np.zeros(BINS, np.int64)
         for block in seen.blocks():
             filled += np.bincount(one.of_points(block.points), minlength=BINS)
-        slab_of_bin, slab, total = np.empty(BINS, np.int64), 0, 0
-        for number, count in enumerate(filled.tolist()):
-            if total and total + count > SLAB_POINTS:
-                slab, total = slab + 1, 0
-            slab_of_bin[number], total = slab, total + count
+        slab_of_bin = tiles.grouped(filled, SLAB_POINTS)
         ends = np.cumsum(np.bincount(slab_of_bin, filled).astype(np.int64))
         return replace(one, slab_of_bin=slab_of_bin, ends=ends)
 

@@ -20,7 +20,7 @@ from processor.geometry import rigid
 from processor.inspection import characteristic
 from processor.inspection.result import InspectedComponent, Quantity, Result
 from processor.limits.judging import Measured
-from processor.model import NORMAL_95, FrameDesign, Scene, Status, reason
+from processor.model import NORMAL_95, Floats, FrameDesign, Scene, Status, reason
 
 CERTAIN = "ok"  # flag of a sphere that nothing contradicts
 
@@ -60,10 +60,10 @@ def _member(
     doubtful: bool,
 ) -> InspectedComponent:
     nodes = int(design.member_a[member]), int(design.member_b[member])
-    length = _length(scene, design, nodes, rows, found, ball)
-    row = tube.get(frozenset(nodes))
-    own = [_alignment(design, nodes, rows, found, ball), *_of_tube(float(design.tube_diameters[member]), found, row)]
-    sizes = {"length": length.nominal, "diameter": float(design.tube_diameters[member])}
+    ends, at, row = design.centres[list(rows)], [ball.get(node, -1) for node in nodes], tube.get(frozenset(nodes))
+    length, diameter = _length(ends, at, found.balls, scene.temperature_C), float(design.tube_diameters[member])
+    own = [_alignment(ends, at, found.balls), *_of_tube(diameter, found.tubes, row)]
+    sizes = {"length": length.nominal, "diameter": diameter}
     seen, name = row is not None or np.isfinite(length.value), name_of(design, member)
     return InspectedComponent(
         name=name,
@@ -73,24 +73,19 @@ def _member(
     )
 
 
-def _length(
-    scene: Scene, design: FrameDesign, nodes: tuple[int, int], rows: tuple[int, int], found: Any, ball: dict[int, int]
-) -> Measured:
+def _length(ends: Floats, at: list[int], balls: Any, temperature_C: float) -> Measured:
     """Distance of the centres of a member's nodes, at the reference temperature if the steel's is known.
 
-    ``rows`` are those of the nodes in the design, ``ball`` those of the balls with a centre, by their nodes.
+    ``ends`` (2, 3) are the nodes as designed, ``at`` the rows of their balls, -1 without a centre.
     """
-    a, b = (design.centres[row] for row in rows)
-    nominal = float(np.linalg.norm(b - a))
-    at = [ball.get(node, -1) for node in nodes]
-    balls = found.balls
+    nominal = float(np.linalg.norm(ends[1] - ends[0]))
     if min(at) < 0 or any(str(balls.evidence[k]) not in SEEN for k in at):
         return characteristic.absent("length", Quantity.LENGTH, nominal, reason("inspect.node-not-seen"))
     off = balls.centres[at[1]] - balls.centres[at[0]]
     actual = float(np.linalg.norm(off))
     along = off / actual
     of_balls = float(sum(along @ balls.covariance[k][:3, :3] @ along for k in at))
-    deviation = actual / thermal.expansion(scene.temperature_C) - nominal
+    deviation = actual / thermal.expansion(temperature_C) - nominal
     length = characteristic.normal(
         "length", Quantity.LENGTH, nominal, deviation, of_balls + scanner_class_errors.scale_variance(actual)
     )
@@ -99,38 +94,34 @@ def _length(
     return replace(length, doubtful=bool(flagged), reasons=why)
 
 
-def _alignment(
-    design: FrameDesign, nodes: tuple[int, int], rows: tuple[int, int], found: Any, ball: dict[int, int]
-) -> Measured:
-    """Distance of a member's end, square to it, from the line as designed through its other end.
+def _alignment(ends: Floats, at: list[int], balls: Any) -> Measured:
+    """Distance of a member's end, square to it, from the line as designed through its other end; ends as of _length.
 
     It is that of the movements of both nodes, by the same datum. What their errors have in common is not taken off.
     """
-    line = np.subtract(*(design.centres[row] for row in rows[::-1]))
+    line = ends[1] - ends[0]
     line /= np.linalg.norm(line)
-    at = [ball.get(node, -1) for node in nodes]
-    moved = found.balls.movement[at] if min(at) >= 0 and len(found.balls.movement) else np.full((2, 3), np.nan)
+    moved = balls.movement[at] if min(at) >= 0 and len(balls.movement) else np.full((2, 3), np.nan)
     if not np.isfinite(moved).all():
         return characteristic.absent("alignment", Quantity.ALIGNMENT, 0.0, reason("inspect.node-not-moved"))
     off = moved[1] - moved[0]
     off = off - (off @ line) * line
     size = float(np.linalg.norm(off))
     across = off / size if size > 0.0 else rigid.axes_across(line)[0]
-    half = NORMAL_95 * float(np.sqrt(across @ found.balls.movement_covariance[at].sum(axis=0) @ across))
+    half = NORMAL_95 * float(np.sqrt(across @ balls.movement_covariance[at].sum(axis=0) @ across))
     return Measured(
         "alignment", size, max(size - half, 0.0), size + half, what=Quantity.ALIGNMENT, unsigned=True,
-        doubtful=any(str(found.balls.flag[k]) != CERTAIN for k in at),
+        doubtful=any(str(balls.flag[k]) != CERTAIN for k in at),
     )  # fmt: skip
 
 
-def _of_tube(diameter: float, found: Any, row: int | None) -> Iterator[Measured]:
-    """Yield diameter and bow of the tube that is row ``row`` of what was found."""
+def _of_tube(diameter: float, tubes: Any, row: int | None) -> Iterator[Measured]:
+    """Yield diameter and bow of the tube in a ``row`` of those found."""
     if row is None:
         why = reason("inspect.tube-not-seen")
         yield characteristic.absent("diameter", Quantity.DIAMETER, diameter, why)
         yield characteristic.absent("bow", Quantity.BOW, 0.0, why)
         return
-    tubes = found.tubes
     sd = 2.0 * float(tubes.radius_ci95[row]) / NORMAL_95
     yield characteristic.normal(
         "diameter", Quantity.DIAMETER, diameter, 2.0 * float(tubes.radii[row]) - diameter, sd**2

@@ -195,10 +195,9 @@ class Registration(Word):
 class Placed:
     """``T`` (4, 4) and ``T_best_fit`` (4, 4) map the scan's local frame to the design's; ``registration`` says how.
 
-    ``covariance`` (6, 6) is that of the best fit. ``shift`` (3,) and ``turn`` are what the best fit does to the scan's
-    middle relative to T. ``ambiguity`` is the ratio of the coarse misfits of the next best attitude and this one; the
-    pose is ``ambiguous`` if no surface distinguishes it from ``T_rival``. ``of_body`` (n,) marks the points that are
-    not of the ground or what stands about the structure; None where all are used.
+    ``covariance`` (6, 6) is that of the best fit. ``ambiguity`` is the ratio of the coarse misfits of the next best
+    attitude and this one; the pose is ``ambiguous`` if no surface distinguishes it from ``T_rival``. ``of_body`` (n,)
+    marks the points that are not of the ground or what stands about the structure; None where all are used.
     """
 
     T: Floats
@@ -207,10 +206,7 @@ class Placed:
     covariance: Floats
     ambiguity: float
     near_share: float
-    shift: Floats
-    turn: float
     weak: tuple[Motion, ...]
-    sigma_mm: float
     T_rival: Floats  # (4, 4) of another attitude that fits as well; NaN without one
     of_body: Bools | None
 
@@ -258,8 +254,6 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str, scanner
     determined = np.isfinite(fitted.covariance).all()
     best_fit = fitted.T_design_scan if determined else np.full((4, 4), NAN)
     T = start if registration is Registration.AS_GIVEN or not determined else best_fit
-    between = best_fit @ rigid.invert(T) if determined else np.full((4, 4), NAN)
-    middle = rigid.apply(T, few.mean(axis=0))
     return Placed(
         T=T,
         registration=registration,
@@ -267,10 +261,7 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str, scanner
         covariance=fitted.covariance,
         ambiguity=ambiguity,
         near_share=share,
-        shift=rigid.apply(between, middle) - middle,
-        turn=rigid.rotation_angle(between[:3, :3]),
         weak=fitted.weak,
-        sigma_mm=fitted.sigma_mm,
         T_rival=rivals[0].T if rivals else np.full((4, 4), NAN),
         of_body=of_body,
     )

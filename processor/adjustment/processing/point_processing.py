@@ -47,7 +47,6 @@ WIDE = 8.0  # extent along an axis, in distances of neighbours, from which it ho
 # common from the smaller ones, and leaves form in the larger ones: the mean of both counts, but of the smaller ones
 # alone where residuals of the larger are BENT times theirs, as at edges and on small balls.
 PATCHES, PATCH_POINTS, FEWER_POINTS, BENT = 100, 160, 64, 2.0
-TERMS, RIDGE = 6, 1e-9  # of a surface of second order, and what keeps it determined where points lie in lines
 FLATTEST, LEAST_FLAT = 8, 25  # of the patches one in as many counts, those without edges and other surfaces
 # Median squared difference of nearest neighbours over that of white noise, in the smaller patches: after means of 6 to
 # 50 neighbours, moving least squares and of samples of meshes it was 0.1 to 0.72; of scanners, whose lines may share
@@ -180,11 +179,8 @@ def _alike(near: Floats) -> _Alike:
     squares, axes = np.linalg.eigh(np.swapaxes(off, 1, 2) @ off)
     size = np.sqrt(np.maximum(squares[:, -1:], np.finfo(float).tiny))
     height, u, v = np.moveaxis(off @ axes / size[:, None], 2, 0)
-    A = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=2)
-    normal = np.swapaxes(A, 1, 2)
-    fitted = A @ np.linalg.solve(normal @ A + RIDGE * np.eye(TERMS), normal @ height[..., None])
-    errors = (height - fitted[..., 0]) * size
-    variance = np.sum(errors**2, axis=1) / (near.shape[1] - TERMS)
+    errors = sphere_smoothness.off_second_order(height, u, v) * size
+    variance = np.sum(errors**2, axis=1) / (near.shape[1] - sphere_smoothness.TERMS)
     flat = np.argsort(variance, kind="stable")[: max(len(variance) // FLATTEST, LEAST_FLAT)]
     if not variance[flat[0]] > 0.0:
         return _Alike(1.0, 1.0, 0.0, flat)
@@ -225,7 +221,8 @@ def _cell(places: list[Floats], spacing: float) -> float:
     edge, most = 0.0, 0.0
     for row in inner[np.argsort(-power[inner], kind="stable")[:PEAKS]]:
         tried = frequency[row] + np.linspace(-0.25, 0.25, STEPS) / extent
-        phases = [np.angle(_transform(place, tried)) / (2.0 * np.pi) for place in places]
+        waves = (np.exp(2j * np.pi * tried[:, None, None] * place[None]).mean(axis=1) for place in places)
+        phases = [np.angle(wave) / (2.0 * np.pi) for wave in waves]
         for step, f in enumerate(tried.tolist()):
             of_cells = [place * f - phase[step] for place, phase in zip(places, phases, strict=True)]
             within = np.array([_beside(one) for one in of_cells])
@@ -251,12 +248,6 @@ def _periodogram(places: list[Floats], spacing: float, extent: float) -> tuple[F
     frequency = np.arange(len(total)) / (4 * bins * width)
     looked = (frequency >= FREQUENCIES[0] / spacing) & (frequency <= FREQUENCIES[1] / spacing)
     return frequency[looked], total[looked] / columns
-
-
-def _transform(points: Floats, frequency: Floats) -> Floats:
-    """Return means (f, 3) of waves of some frequencies (f,) along the axes, at points (n, 3); complex."""
-    waves: Floats = np.exp(2j * np.pi * frequency[:, None, None] * points[None]).mean(axis=1)
-    return waves
 
 
 def _beside(places: Floats) -> float:

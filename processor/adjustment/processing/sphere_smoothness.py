@@ -34,11 +34,8 @@ def ratio(directions: Floats, errors: Floats) -> float:
     parts = _parts(directions)
     own = directions[parts] - directions[parts].mean(axis=1, keepdims=True)
     v, w = np.moveaxis(own @ np.linalg.eigh(np.swapaxes(own, 1, 2) @ own)[1], 2, 0)[1:]
-    A = np.stack([np.ones_like(v), v, w, v * v, v * w, w * w], axis=2)
-    normal = np.swapaxes(A, 1, 2)
-    fitted = A @ np.linalg.solve(normal @ A + RIDGE * np.eye(TERMS), normal @ errors[parts][..., None])
     left, part = np.zeros(len(errors)), np.full(len(errors), -1)
-    left[parts], part[parts] = errors[parts] - fitted[..., 0], np.arange(len(parts))[:, None]
+    left[parts], part[parts] = off_second_order(errors[parts], v, w), np.arange(len(parts))[:, None]
     variance = np.sum(left[parts] ** 2, axis=1) / (parts.shape[1] - TERMS)
     rows = parts[:, :: max(1, parts.size // LOOKED_AT)].ravel()
     near = cKDTree(directions).query(directions[rows], k=NEAREST)[1][:, 1:]
@@ -46,6 +43,15 @@ def ratio(directions: Floats, errors: Floats) -> float:
     squares = np.where(within, (left[near] - left[rows, None]) ** 2, 0.0)
     sums, pairs = (np.bincount(part[rows], one.sum(axis=1), len(parts)) for one in (squares, within))
     return float(np.median(0.5 * sums / np.maximum(pairs * variance, np.finfo(float).tiny)))
+
+
+def off_second_order(height: Floats, v: Floats, w: Floats) -> Floats:
+    """Return what surfaces of second order over places v, w (p, m) leave of heights (p, m) of points of patches."""
+    A = np.stack([np.ones_like(v), v, w, v * v, v * w, w * w], axis=2)
+    normal = np.swapaxes(A, 1, 2)
+    fitted = A @ np.linalg.solve(normal @ A + RIDGE * np.eye(TERMS), normal @ height[..., None])
+    left: Floats = height - fitted[..., 0]
+    return left
 
 
 def _parts(directions: Floats) -> Ints:

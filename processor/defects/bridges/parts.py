@@ -28,12 +28,19 @@ def defects(
 
     Poses are those of the parts, in the table ``parts``; defects are numbered over all parts.
     """
-    results = [_of_part(part, method, deviation, one) for part in parts]
+    results = [
+        Result(status=Status.FAILED, method=method, reasons=part.reasons)
+        if part.scene is None
+        else one(part.scene, _pose(part.name, deviation))
+        for part in parts
+    ]
     known = [result for result in results if result.status is not Status.FAILED]
     status, reasons = bridge_parts.together(parts, results)
     if not known:
         return Result(status=status, method=method, reasons=reasons, parts=_table(parts, results))
     found = list(_numbered(known))
+    # A picture a defect: empty ones for those of which there is none
+    pictures = ([*one.pictures, *[Picture()] * (len(one.defects) - len(one.pictures))] for one in found)
     return Result(
         status=status,
         method=method,
@@ -48,17 +55,11 @@ def defects(
         points_used=sum(result.points_used for result in known),
         least_depth=_least_depth(known),
         defects=Defects.concat([result.defects for result in found if len(result.defects)]),
-        pictures=tuple(chain.from_iterable(_pictures(result) for result in found)),
+        pictures=tuple(chain.from_iterable(pictures)),
         surface=SurfacePlaces.concat([result.surface for result in found if len(result.surface)]),
         limits=JudgedLimits.joined(depths_and_areas.judge(scene, result) for result in found),
         parts=_table(parts, results),
     )
-
-
-def _of_part(part: PartScene, method: str, deviation: Any, one: Callable[[Scene, dict[str, Any]], Result]) -> Result:
-    if part.scene is None:
-        return Result(status=Status.FAILED, method=method, reasons=part.reasons)
-    return one(part.scene, _pose(part.name, deviation))
 
 
 def _pose(name: str, deviation: Any) -> dict[str, Any]:
@@ -84,12 +85,6 @@ def _numbered(results: Sequence[Result]) -> Iterator[Result]:
             surface=replace(result.surface, defect=np.where(places < 0, places, places + before)),
         )
         before += len(result.defects)
-
-
-def _pictures(result: Result) -> Iterator[Picture]:
-    """Yield a picture a defect; empty ones for those of which there is none."""
-    for row in range(len(result.defects)):
-        yield result.pictures[row] if row < len(result.pictures) else Picture()
 
 
 def _least_depth(results: Sequence[Result]) -> Windows:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from processor.adjustment.robust_least_squares import sandwich
-from processor.model import Floats, Ints, Word
+from processor.model import Floats, Word
 
 MODEL_SHARE = 0.1  # of the depth, by which a place may deviate from the shape of a model
 BLOCK_SHARE = 0.5  # of a place's half size: blocks of residuals that agree
@@ -88,9 +88,11 @@ def fit(cells: PlaceCells, sign: int) -> Fit | None:
             continue
         chi2 = 2.0 * float(solved.cost)
         if profile not in best or chi2 < best[profile][0]:
-            depth_sd = _sd(solved.jac * sd[:, None], value - model(uv, solved.x), _blocks(uv, cells.half))
-            found = Fit(profile, float(solved.x[0]), depth_sd, float(solved.x[2]), 0.0)
-            best[profile] = chi2, found
+            # By blocks, a few across the place: where it is not quite of the model's shape, residuals of a block agree.
+            block = np.unique(np.floor(uv / (BLOCK_SHARE * cells.half)), axis=0, return_inverse=True)[1].reshape(-1)
+            J, residual = solved.jac * sd[:, None], value - model(uv, solved.x)
+            depth_sd = np.sqrt(sandwich(np.linalg.pinv(J.T @ J), J * residual[:, None], block)[0, 0])
+            best[profile] = chi2, Fit(profile, float(solved.x[0]), float(depth_sd), float(solved.x[2]), 0.0)
             if profile is Profile.BUMP:
                 middle, reach = solved.x[[1, 3]], solved.x[[2, 4]]
                 inside = bool((np.minimum(middle - cells.low, cells.high - middle) > AT_BORDER * reach).all())
@@ -145,17 +147,3 @@ def _shown(uv: Floats, x: Floats, axis: int, cell_mm: float) -> bool:
 def _bump(s: Floats, exponent: float) -> Floats:
     value: Floats = np.maximum(1.0 - s**2, 0.0) ** exponent
     return value
-
-
-def _blocks(uv: Floats, half: Floats) -> Ints:
-    """Return the block (n,) of cells (n, 2), a few across a place, in which a model misses in the same sense."""
-    block: Ints = np.unique(np.floor(uv / (BLOCK_SHARE * half)), axis=0, return_inverse=True)[1].reshape(-1)
-    return block
-
-
-def _sd(J: Floats, residual: Floats, block: Ints) -> float:
-    """Return the sd of the first parameter by its Jacobian (n, k), residuals (n,) and their blocks (n,), mm.
-
-    A sandwich over blocks (Liang and Zeger 1986): where the place is not quite of the model's shape, residuals agree.
-    """
-    return float(np.sqrt(sandwich(np.linalg.pinv(J.T @ J), J * residual[:, None], block)[0, 0]))
