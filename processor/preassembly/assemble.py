@@ -25,7 +25,6 @@ from processor.preassembly.chain import (
     span_and_closure,
 )
 from processor.preassembly.chain.adjustment import Adjusted
-from processor.preassembly.ends import section
 from processor.preassembly.ends.joint_frame import end_place, joint_frame
 from processor.preassembly.params import AdjustParams, Params, TrimParams
 from processor.preassembly.parts import measure, straightening
@@ -86,11 +85,11 @@ def assemble(
 
 def _on_steel(shapes: Shapes, design: ArchDesign) -> Bools:
     """Mark the key points (j, 8) of the joints that lie on steel: the middle of an open side of an I does not."""
-    marks = [
-        section.on_steel([end_place(points, 1.0, shapes[part].mesh).section for part in pair])
-        for points, pair in zip(design.joint_points, design.joined.tolist(), strict=True)
-    ]
-    return np.array(marks, bool).reshape(-1, 8)
+    marks = np.ones((len(design.joint_points), 8), bool)
+    for mark, points, pair in zip(marks, design.joint_points, design.joined.tolist(), strict=True):
+        for part in pair:
+            mark[4:] &= np.array(end_place(points, 1.0, shapes[part].mesh).section.middles) >= 0
+    return marks
 
 
 def _adjust(

@@ -7,7 +7,6 @@ plate is thick. So a corner always is where an upright face, a level face and th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -129,12 +128,6 @@ def of_surface(half: Floats, T_bridge_joint: Floats, surface: MeshSurface) -> Se
     if closed.all() or not all(closed[(k + 1) % 4] and thickness[(k + 1) % 4] > 0.0 for k in range(4) if not closed[k]):
         return of_box(half)
     return _made(half, tuple(closed.tolist()), thickness)
-
-
-def on_steel(sections: Sequence[Section]) -> Bools:
-    """Mark the key points (8,) of a joint of parts with these sections that lie on steel: not those of open sides."""
-    open_sides = [[face < 0 for face in one.middles] for one in sections]
-    return np.concatenate([np.ones(4, bool), ~np.any(open_sides, axis=0)])
 
 
 def plate_thickness(half: Floats, T_bridge_joint: Floats, surface: MeshSurface, axis: int, sense: float) -> float:

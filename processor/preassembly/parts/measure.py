@@ -204,13 +204,19 @@ def estimate(parts: Sequence[FittedPart], systematic: SystematicParams) -> list[
     between = _between_viewpoints(parts)
     if not systematic.known:
         between = between.or_of_class()
-    contradicted = contradictions.find([_examined(part) for part in parts])
+    examined = [
+        contradictions.Examined(
+            tuple((j, e) for j, e in zip(part.joints, part.ends, strict=True) if isinstance(e, FittedEnd)),
+            part.measured.member.edges,
+        )
+        for part in parts
+    ]
     seen = [_as_seen(part, between) for part in parts]
     fitted = [(end, part.views.left) for part in seen for end in part.ends if isinstance(end, FittedEnd)]
     of_ends = [between._replace(level=left * between.level) for _, left in fitted]
     estimated = iter(joint_end.estimate([end for end, _ in fitted], of_ends))
     measured = []
-    for part, contradiction in zip(seen, contradicted, strict=True):
+    for part, contradiction in zip(seen, contradictions.find(examined), strict=True):
         of_tubes = between._replace(level=part.views.left * between.level)
         ends = [
             next(estimated)
@@ -220,25 +226,18 @@ def estimate(parts: Sequence[FittedPart], systematic: SystematicParams) -> list[
             else end
             for end in part.ends
         ]
-        with_systematic = tuple(
-            None if end is None else systematic_errors.added_to_end(end, systematic, part.part) for end in ends
-        )
-        member = replace(part.measured.member, ends=with_systematic)
+        common = systematic_errors.end_variances(systematic, part.part)
+        of_end = np.kron(np.ones((8, 8)), np.diag(common[:3]))
+        ends = [None if end is None else replace(end, covariance=end.covariance + of_end) for end in ends]
+        member = replace(part.measured.member, ends=tuple(ends))
         outer = part.measured.outer
         if outer is not None:
-            variance = outer.variance + systematic_errors.end_variances(systematic, part.part)[0]
+            variance = outer.variance + common[0]
             outer = replace(outer, variance=variance + (between.ring if part.views.left else 0.0))
         reasons = (*contradiction, *part.measured.reasons, *_viewpoint_remarks(part, between))
         status = Status.WEAK if contradiction and part.measured.status == Status.OK else part.measured.status
         measured.append(replace(part.measured, member=member, status=status, reasons=reasons, outer=outer))
     return measured
-
-
-def _examined(part: FittedPart) -> contradictions.Examined:
-    ends = zip(part.joints, part.ends, strict=True)
-    return contradictions.Examined(
-        tuple((joint, end) for joint, end in ends if isinstance(end, FittedEnd)), part.measured.member.edges
-    )
 
 
 def _viewpoint_remarks(part: FittedPart, between: view_variance.Variances) -> Iterator[Reason]:
@@ -502,9 +501,10 @@ def _register(scan: Scan, points: Floats, station: Ints, index: int, shapes: att
         return replace(placed, rejected=pose.reasons)
     registration = surface_registration.fine(points, shape.mesh, shape.axes, pose.T_surface)
     placed = replace(placed, registration=registration)
-    plated = _plated(points, registration.T_design_scan, index, shapes)
+    at_design = rigid.apply(registration.T_design_scan, thinned(points, surface_registration.LAST_POINTS))
+    plated = tuple(joint for joint, place in _joint_ends(index, shapes) if beyond_ends.plates(at_design, place))
     if plated:
-        return replace(placed, rejected=plated)
+        return replace(placed, rejected=(reason("preassemble.splice-plates", joints=plated),))
     misfit = _misfit(registration)
     if misfit:
         return replace(placed, rejected=(*misfit, *(_resemblance(points, index, shapes) or RIGHT_PART)))
@@ -520,13 +520,6 @@ def _register(scan: Scan, points: Floats, station: Ints, index: int, shapes: att
             doubt = reason("preassemble.sides-not-covered", share=away, covered=covered)
             placed = replace(placed, doubts=(doubt, *RIGHT_PART))
     return replace(placed, identity=identity.identify(points, registration.T_design_scan, index, shapes))
-
-
-def _plated(points: Floats, T: Floats, index: int, shapes: attitude.Shapes) -> tuple[Reason, ...]:
-    """State at which joints the points (n, 3), placed by T (4, 4), have splice plates; () for none."""
-    placed = rigid.apply(T, thinned(points, surface_registration.LAST_POINTS))
-    joints = tuple(joint for joint, place in _joint_ends(index, shapes) if beyond_ends.plates(placed, place))
-    return (reason("preassemble.splice-plates", joints=joints),) if joints else ()
 
 
 def _joint_ends(index: int, shapes: attitude.Shapes) -> list[tuple[str, EndPlace]]:

@@ -67,7 +67,8 @@ def find(scans: Sequence[tuple[Floats, float, Floats]], up: Floats, beam: Beam, 
     under = _underside((mesh_distance.sampled(part.vertices, part.faces, SAMPLE_MM).points - origin) @ axes.T)
     near = np.concatenate([_about(scan, origin, axes, under) for scan in scans])
     cell = (near[:, 0] / CELL_MM).astype(np.int64)
-    below, across = near[:, 2] - under.low[cell], _outside(near[:, 1], under, cell)
+    below = near[:, 2] - under.low[cell]
+    across = np.maximum(under.left[cell] - near[:, 1], near[:, 1] - under.right[cell])  # negative between the sides
     floor = _floor(near[below < -CONTACT_MM])
     if floor is None or _hangs(near[(across < 0.0)], under, cell[across < 0.0]):
         return None
@@ -125,12 +126,6 @@ def _about(scan: tuple[Floats, float, Floats], origin: Floats, axes: Floats, und
         inside = (placed[:, 0] >= 0.0) & (placed[:, 0] < CELL_MM * len(under.low))
         found.append(placed[inside & (placed[:, 1] > left) & (placed[:, 1] < right) & (placed[:, 2] < high + HANGS_MM)])
     return np.concatenate(found)
-
-
-def _outside(across: Floats, under: _Under, cell: Ints) -> Floats:
-    """Distances (n,) beyond the part's sides, negative between them."""
-    outside: Floats = np.maximum(under.left[cell] - across, across - under.right[cell])
-    return outside
 
 
 def _floor(below: Floats) -> float | None:

@@ -14,7 +14,6 @@ from processor.adjustment.thermal import EXPANSION_PER_K
 from processor.model import DesignPart, Floats, Word
 from processor.preassembly.ends import bottom_edges
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
-from processor.preassembly.ends.joint_end import JointEnd
 from processor.preassembly.params import SystematicParams
 
 
@@ -37,12 +36,6 @@ def budget(params: SystematicParams, length_mm: float) -> dict[BudgetSource, flo
         BudgetSource.SCALE: 1e-6 * params.scale_ppm * half,
         BudgetSource.TEMPERATURE: EXPANSION_PER_K * params.temperature_C * half,
     }
-
-
-def added_to_end(end: JointEnd, params: SystematicParams, part: DesignPart) -> JointEnd:
-    """Return an end of a part with its systematic errors in the covariance."""
-    common = np.kron(np.ones((8, 8)), np.diag(end_variances(params, part)[:3]))
-    return replace(end, covariance=end.covariance + common)
 
 
 def end_variances(params: SystematicParams, part: DesignPart) -> Floats:
