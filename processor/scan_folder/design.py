@@ -12,6 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from processor.distinct_rows import components
 from processor.geometry import box_girder_mesh
 from processor.language.messages import messages
 from processor.meshes import faults
@@ -312,10 +313,8 @@ def _check_graph(design: ArchFile, arch: ArchDesign) -> None:
             f"{design.where}: expected a name of its own for each joint, found {', '.join(arch.joint_names)}"
         )
     joined = arch.joined
-    reached = {0}
-    for _ in arch.parts:
-        reached |= {part for pair in joined.tolist() if reached & set(pair) for part in pair}
-    apart = [part.name for k, part in enumerate(arch.parts) if k not in reached]
+    piece = components(len(arch.parts), *joined.T)
+    apart = [part.name for part, number in zip(arch.parts, piece.tolist(), strict=True) if number != piece[0]]
     if apart:
         raise InputError(
             f"{design.where}: no chain of joints joins {apart[0]!r} to {arch.parts[0].name!r}; add the joints"

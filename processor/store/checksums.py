@@ -49,13 +49,8 @@ def begin(path: str, dataset: Any) -> Any:
     return hashlib.sha256(f"{path}:{dataset.dtype.str}{tuple(dataset.shape)};".encode())
 
 
-def seal(dataset: Any, path: str, array: np.typing.NDArray[Any]) -> str:
-    """Give a dataset, one of h5py's low-level interface, the checksum of the array that was written to it."""
-    return seal_parts(dataset, path, array, [array])
-
-
-def seal_parts(dataset: Any, path: str, array: np.typing.NDArray[Any], parts: Iterable[np.typing.NDArray[Any]]) -> str:
-    """Give a dataset the checksum of the parts of an array that are written to it; returns the checksum."""
+def seal(dataset: Any, path: str, array: np.typing.NDArray[Any], parts: Iterable[np.typing.NDArray[Any]]) -> str:
+    """Give a low-level dataset the checksum of an array, whose parts are written to it; returns the checksum."""
     digest = begin(path, array)
     for part in parts:
         digest.update(np.ascontiguousarray(part).data if part.size else b"")
@@ -214,10 +209,8 @@ class Column:
         if self._all is not None or not isinstance(rows, slice):
             data = (read(self.dataset) if self._all is None else self._all)[rows]
             return data
-        try:
+        with _damage(self.dataset):
             data = self.dataset[rows]
-        except (OSError, RuntimeError) as error:
-            raise ChecksumError(f"{self.dataset.name}: is damaged ({error}); make or copy the file again") from error
         if self._known is not None and self._place not in _WHOLE and rows.step in (None, 1):
             self._continue(rows.indices(len(self))[0], data)
         return data

@@ -74,14 +74,14 @@ def _create(group: Any, name: str, data: Any, **options: Any) -> None:
         kind, in_memory = _kinds(array.dtype.str, array.dtype.metadata is not None)
         made = h5py.h5d.create(group.id, name.encode(), kind, _space(array.shape), dcpl=_plain())
         made.write(h5py.h5s.ALL, h5py.h5s.ALL, array, in_memory)
-        checksum = checksums.seal(made, path, array)
+        checksum = checksums.seal(made, path, array, [array])
     elif len(array) <= options["chunks"][0]:
         made = group.create_dataset(name, data=data, **options).id
-        checksum = checksums.seal(made, path, array)
+        checksum = checksums.seal(made, path, array, [array])
     else:
         dataset = group.create_dataset(name, array.shape, array.dtype, **options)
         made = dataset.id
-        checksum = checksums.seal_parts(made, path, array, _written(dataset, array, options["chunks"][0]))
+        checksum = checksums.seal(made, path, array, _written(dataset, array, options["chunks"][0]))
     known = _SEALED.get()
     if known is not None:
         known[path] = checksum

@@ -176,6 +176,7 @@ def write_results(path: Path, runs: Sequence[StepRun], provenance: Mapping[str, 
 
 _SOUND: dict[file_structure_checks.State, file_structure_checks.Structure] = {}  # by the state of a file
 SETTLED_S = 2.0  # since a file was written
+MOST_LISTED = 20  # faults of a file in a message
 
 
 # --- reading ---------------------------------------------------------------------------------------------------------
@@ -200,7 +201,8 @@ def opened(path: Path, kinds: Sequence[str]) -> Iterator[Any]:
                 raise DecodeError(faults)
             yield file
     except DecodeError as error:
-        raise InputError(_listed(error.problems), path=path) from error
+        more = [f"and {len(error.problems) - MOST_LISTED} more"] if len(error.problems) > MOST_LISTED else []
+        raise InputError("; ".join([*error.problems[:MOST_LISTED], *more]), path=path) from error
     except checksums.ChecksumError as error:
         raise InputError(str(error), path=path) from error
     except FileNotFoundError:
@@ -233,11 +235,6 @@ def _structure(path: Path) -> file_structure_checks.Structure:
     if sound and structure.state == state and time.time() - status.st_mtime > SETTLED_S:
         _SOUND[state] = structure
     return structure
-
-
-def _listed(problems: Sequence[str], most: int = 20) -> str:
-    more = [f"and {len(problems) - most} more"] if len(problems) > most else []
-    return "; ".join([*problems[:most], *more])
 
 
 def _header_problems(file: Any, kinds: Sequence[str], known: Mapping[str, str | None]) -> list[str]:

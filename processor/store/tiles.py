@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import types
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,14 @@ class Grid:
     offset: Floats  # (3,) steps
     lower: Floats  # (3,) corner of the first tile, steps of the stored columns
     edge: float  # of a tile, steps
+
+    def columns(self, points: Floats) -> tuple[Column, Column, Column]:
+        """Return the stored columns of points (n, 3) in mm."""
+        if self.steps_per_mm == 1.0:
+            x, y, z = (np.ascontiguousarray(points[:, i]) for i in range(3))
+            return x, y, z
+        x, y, z = ((np.rint(points[:, i] * self.steps_per_mm) - self.offset[i]).astype(np.int32) for i in range(3))
+        return x, y, z
 
     def cells(self, columns: tuple[Column, Column, Column]) -> Ints:
         """Return the cell numbers (n, 3) of stored columns."""
@@ -82,22 +90,21 @@ def arrange(points: Floats, others: Mapping[str, Array] = types.MappingProxyType
         return Tiles(
             grid, cell=cell, start=empty, count=empty, columns=(none, none, none), order=empty, others=dict(others)
         )
-    scale = _scale(points)
     # Enough levels of the finest grid for points on a line, and two more for gaps
     levels = int(np.clip(np.ceil(np.log2(len(points) / POINTS_PER_TILE)) + 2, 0, MOST_LEVELS))
-    grid = _finest(points, scale, levels)
+    grid = _finest(points, _scale(points), levels)
     finest = np.zeros(2 ** (3 * levels), np.int32)
     for rows in large_arrays.blocks(len(points)):
-        np.add.at(finest, _numbers(grid.cells(scale.columns(points[rows])), levels), 1)
+        np.add.at(finest, _numbers(grid.cells(grid.columns(points[rows])), levels), 1)
     level, counts = _level(finest.reshape((2**levels,) * 3), len(points), levels)
     shift = levels - level
     keys = np.flatnonzero(counts)
     count = counts.reshape(-1)[keys].astype(np.int64)
     start = np.cumsum(count) - count
-    columns, sorted_others, order = _in_tiles(points, others, scale, grid, (keys, start, level, shift))
+    columns, sorted_others, order = _in_tiles(points, others, grid, (keys, start, level, shift))
     mask = 2**level - 1
     return Tiles(
-        grid=Grid(scale.steps_per_mm, scale.offset, grid.lower, grid.edge * 2**shift),
+        grid=replace(grid, edge=grid.edge * 2**shift),
         cell=np.stack([keys >> 2 * level, (keys >> level) & mask, keys & mask], axis=1).astype(np.int64),
         start=start,
         count=count,
@@ -108,14 +115,14 @@ def arrange(points: Floats, others: Mapping[str, Array] = types.MappingProxyType
 
 
 def _in_tiles(
-    points: Floats, others: Mapping[str, Array], scale: _Scale, grid: Grid, tiles: tuple[Ints, Ints, int, int]
+    points: Floats, others: Mapping[str, Array], grid: Grid, tiles: tuple[Ints, Ints, int, int]
 ) -> tuple[tuple[Column, Column, Column], dict[str, Array], Ints]:
     """Return the columns of points and of what else there is of each, and the rows they are from, by their tiles.
 
     A counting sort, block by block: of each tile (numbers of cells of a level, first rows) the next row is known.
     """
     keys, start, level, shift = tiles
-    n, dtype = len(points), np.int32 if scale.steps_per_mm > 1.0 else np.float64
+    n, dtype = len(points), np.int32 if grid.steps_per_mm > 1.0 else np.float64
     x, y, z = (large_arrays.allocate(n, dtype=dtype) for _ in range(3))
     order = large_arrays.allocate(n, dtype=np.int64)
     found = {name: large_arrays.allocate(n, *a.shape[1:], dtype=a.dtype.type) for name, a in others.items()}
@@ -125,7 +132,7 @@ def _in_tiles(
     # numpy sorts 16-bit numbers by radix sort, which is several times faster.
     kind = np.uint16 if len(keys) < 2**16 else np.uint32
     for rows in large_arrays.blocks(n):
-        stored = scale.columns(points[rows])
+        stored = grid.columns(points[rows])
         cells = grid.cells(stored) >> shift
         tile = rank[_numbers(cells, level)].astype(kind)
         sort = np.argsort(tile, kind="stable")
@@ -167,33 +174,18 @@ def misplaced(grid: Grid, cell: Ints, columns: tuple[Column, Column, Column]) ->
     return int((grid.cells(columns) != cell).any(axis=1).sum())
 
 
-@dataclass(frozen=True)
-class _Scale:
-    """How points are stored: in whole steps, less an offset, or as float64 mm (1 step per mm)."""
-
-    steps_per_mm: float
-    offset: Floats
-
-    def columns(self, points: Floats) -> tuple[Column, Column, Column]:
-        """Return the stored columns of points (n, 3) in mm."""
-        if self.steps_per_mm == 1.0:
-            x, y, z = (np.ascontiguousarray(points[:, i]) for i in range(3))
-            return x, y, z
-        x, y, z = ((np.rint(points[:, i] * self.steps_per_mm) - self.offset[i]).astype(np.int32) for i in range(3))
-        return x, y, z
-
-
-def _scale(points: Floats) -> _Scale:
+def _scale(points: Floats) -> Grid:
+    """Return one cell that says how points are stored: in whole steps, less an offset, or as float64 mm."""
     corners = [(points[rows].min(axis=0), points[rows].max(axis=0)) for rows in large_arrays.blocks(len(points))]
     low, high = np.min([low for low, _ in corners], axis=0), np.max([high for _, high in corners], axis=0)
     for steps in STEPS_PER_MM:
         first, last = np.rint(low * steps), np.rint(high * steps)
         if (last - first).max() < 2 * INT32_REACH and max(np.abs(first).max(), np.abs(last).max()) < 2.0**52:
-            return _Scale(steps, np.floor((first + last) / 2.0))
-    return _Scale(1.0, np.zeros(3))
+            return Grid(steps, np.floor((first + last) / 2.0), np.zeros(3), 1.0)
+    return Grid(1.0, np.zeros(3), np.zeros(3), 1.0)
 
 
-def _finest(points: Floats, scale: _Scale, levels: int) -> Grid:
+def _finest(points: Floats, scale: Grid, levels: int) -> Grid:
     """Return the finest grid of points."""
     corners = []
     for rows in large_arrays.blocks(len(points)):
@@ -206,7 +198,7 @@ def _finest(points: Floats, scale: _Scale, levels: int) -> Grid:
     edge = float(np.ceil((extent + 1.0) / 2**levels))
     if scale.steps_per_mm == 1.0:
         edge = (extent or 1.0) / 2.0**levels * (1.0 + 1e-9)
-    return Grid(scale.steps_per_mm, scale.offset, lower, edge)
+    return replace(scale, lower=lower, edge=edge)
 
 
 def _level(counts: Array, n: int, levels: int) -> tuple[int, Array]:

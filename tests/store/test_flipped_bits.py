@@ -90,7 +90,8 @@ def test_chunks_that_change_places_are_noticed_when_all_are_read(tmp_path):
     path = tmp_path / "s.h5"
     with h5py.File(path, "w") as file:
         data = file.create_dataset("x", data=np.repeat([1, 2], 4), chunks=(4,), fletcher32=True)
-        checksums.seal(data.id, data.name, np.repeat([2, 1], 4))
+        other = np.repeat([2, 1], 4)
+        checksums.seal(data.id, data.name, other, [other])
         column = checksums.Column(data)
         assert column[4:8].tolist() == [2] * 4
         assert column[0:4].tolist() == [1] * 4
