@@ -197,6 +197,12 @@ def corners(points: Array) -> tuple[Array, Array]:
     return np.min(parts, axis=0)[:, 0], np.max(parts, axis=0)[:, 1]
 
 
+def span(points: Array) -> Array:
+    """Return the extent (m,) of an array (n, m), n > 0, along each axis."""
+    low, high = corners(points)
+    return high - low
+
+
 def centroid(points: Array) -> Array:
     """Return the mean (m,) of the rows of an array (n, m), n > 0, to the bit of np.mean: rows are added one by one."""
     sums = np.zeros(points.shape[1:])

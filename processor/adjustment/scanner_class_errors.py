@@ -101,11 +101,6 @@ def of_scan(given: Sequence[Instrument], name: str) -> Sequence[Instrument]:
     return [one for one in given if name in one.scans or not one.scans][:1]
 
 
-def of_class(name: str) -> ScannerErrors:
-    """Return what is known of a class by its name; of "" that of the scanner in use."""
-    return CLASSES[name] if name else known()
-
-
 def scale_variance(length: float) -> float:
     """Return the variance, mm^2, of a length, mm, by the scale of the scanner."""
     return (known().scale * length) ** 2
@@ -121,13 +116,13 @@ def mean_offset_sd(views: int, square: float = 0.0, dof: float = 0.0) -> float:
     return math.hypot(known().offset_mm, math.sqrt(of_view / views))
 
 
-def view_errors(ranges: Floats, cosines: Floats, view: Ints, instrument: str = "") -> Floats:
+def view_errors(ranges: Floats, cosines: Floats, view: Ints) -> Floats:
     """Errors (n, v + 1), mm, of ranges (n,) by independent standard variates, along the rays.
 
     One variate a view (n,), numbered from 0, is its offset and its scale. The last is the bias by incidence that all
     surfaces have in common, of ``cosines`` (n,): a footprint is longer by 1 / cosine, and its mean range off with it.
     """
-    of = of_class(instrument)
+    of = known()
     of_view = np.sqrt(of.view_mm**2 + (of.scale * ranges) ** 2)[:, None] * (view[:, None] == np.arange(view.max() + 1))
     return np.column_stack([of_view, of.incidence_mm * (1.0 / cosines - 1.0)])
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from processor import large_arrays
 from processor.model import Floats, Ints, UsageError
 
 LEAST_EXTENT_MM = 2.0  # nothing that is scanned is smaller: the coordinates are in metres
@@ -70,7 +71,7 @@ def points_of(values: npt.ArrayLike, name: str, least: int, in_mm: bool = True) 
 
 def extent_of(points: Floats) -> float:
     """Longest side of the box around points (n, 3) along the axes."""
-    return float(np.ptp(points, axis=0).max())
+    return float(large_arrays.span(points).max())
 
 
 def positions_of(values: npt.ArrayLike, name: str, shape: tuple[int, ...]) -> Floats:

@@ -149,7 +149,7 @@ def fit_sphere(
     params = Params(radius_mm=float("nan") if held is None else held, max_balls=1)
     with scanner_class_errors.used(_instrument(instrument)):
         row = _measured(MergedCloud(cloud - origin, origin, seen_from), params, held)
-        assumed = search_without_design.by_class(params)
+        assumed = search_without_design.by_class()
     if row.sphere is None:
         return _no_sphere((*row.reasons, *coincident), held)
     fitted = SphereFit(
@@ -172,8 +172,7 @@ def _instrument(name: str | Path) -> Sequence[Instrument]:
     if str(name).lower().endswith(".toml"):
         return (instruments.from_file(read_toml(Path(name)), Place(str(name))),)
     if str(name):
-        known = ", ".join(instruments.class_names())
-        raise ValueError(f"instrument: expected one of {known}, or a scanner.toml, got {str(name)!r}")
+        raise ValueError(f"instrument: {instruments.unknown(str(name))}")
     return ()
 
 
@@ -205,7 +204,7 @@ def _measured(cloud: MergedCloud, params: Params, held: float | None) -> Row:
             return search_without_design.fitted(0, balls[0], cloud, params)
         if found is None:
             return missing(0, NAN, 0, search_without_design.no_ball(cloud, params))
-    row = search_without_design.fitted(0, found.ball, cloud, params)
+    row = search_without_design.fitted(0, found, cloud, params)
     if found.certain:
         return row
     return replace(row, flag=Flag.LOW_CONFIDENCE, reasons=(*row.reasons, reason("spheres.not-only-sphere")))

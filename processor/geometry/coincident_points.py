@@ -41,6 +41,7 @@ FEWEST_COPIED = 100  # points of a cloud, of which 5 lie so by chance once in 70
 SMALL_STEP = 0.1  # of the distance to the fourth neighbour: coarser rounding makes neighbours of places
 PLACES, PLACE_POINTS = 8, 2000  # of a cloud that are looked at: 45 points wide
 LOOKED_AT = 500  # points of a place: a share of 5 % is known to 1 %
+FEW: dict[str, bool] = {"balanced_tree": False, "compact_nodes": False}  # of trees that are asked for few points
 NEIGHBOURS = np.array([step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0)], np.int64)  # of 26
 # Odd numbers that mix bits: of the golden ratio (SplitMix64), and two primes of xxHash64.
 MIXERS = tuple(np.uint64(number) for number in (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9))
@@ -99,9 +100,11 @@ class _Clouds:
 def lattice_of(points: Floats) -> Lattice:
     """Find the lattice that the coordinates of points (n, 3) are rounded to, axis by axis."""
     sample = np.asarray(thinned(points, LATTICE_SAMPLE)[: 2 * LATTICE_SAMPLE])
-    extent = float(np.ptp(sample, axis=0).max())
+    extent = float(large_arrays.span(sample).max())
     least = max(LEAST_STEP * extent, PRECISION * float(np.abs(sample).max()), 1e-300)
-    return Lattice(sample.min(axis=0), np.array([_step(np.unique(column), least) for column in sample.T]), least)
+    return Lattice(
+        large_arrays.corners(sample)[0], np.array([_step(np.sort(column), least) for column in sample.T]), least
+    )
 
 
 def rounding_of(points: Floats) -> float:
@@ -110,13 +113,14 @@ def rounding_of(points: Floats) -> float:
     It is the least of the axes along which they differ: profiles at even distances, and the nodes of a grid in plan,
     have greater steps along one or two axes, and other coordinates with all their digits.
     """
-    step = lattice_of(points).step[np.ptp(points, axis=0) > 0.0]
+    step = lattice_of(points).step[large_arrays.span(points) > 0.0]
     return float(step.min()) if len(step) else 0.0
 
 
 def _step(values: Floats, least: float) -> float:
     """Return the greatest length that the differences of ascending values (n,) are multiples of (Euclid); 0 = none."""
     rest = np.diff(values)
+    rest = rest[rest > 0.0]
     step = np.inf
     while len(rest):
         step = float(rest.min())
@@ -174,7 +178,7 @@ def _without_copies(points: Floats, step: float) -> Bools:
         return ~beside
     points = np.asarray(points)
     near = [
-        cKDTree(points[rows]).query(points[rows[:: max(len(rows) // LOOKED_AT, 1)]], k=BESIDE)[0]
+        cKDTree(points[rows], **FEW).query(points[rows[:: max(len(rows) // LOOKED_AT, 1)]], k=BESIDE)[0]
         for rows in some_places(points)
     ]
     away = np.concatenate(near)
@@ -229,7 +233,11 @@ def _sampled(whole: _Clouds, lattice: Lattice) -> Ints:
 
 def _are_duplicated(lattice: Lattice, places: Ints) -> bool:
     """Whether more of places (m, 3) coincide than the lattice explains."""
-    keys, first, count = np.unique(_keys_of_places(places), return_index=True, return_counts=True)
+    every = _keys_of_places(places)
+    ordered = np.sort(every)
+    if not (ordered[1:] == ordered[:-1]).any():
+        return False
+    keys, first, count = np.unique(every, return_index=True, return_counts=True)
     pairs = float(np.sum(count * (count - 1.0)))
     rounded = lattice.step > 0.0
     across = int(np.ptp(places, axis=0).max())

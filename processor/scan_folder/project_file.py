@@ -19,11 +19,10 @@ from processor.model import (
     Steel,
     TitleBlock,
     Tolerance,
-    did_you_mean,
     instruments,
     reason,
 )  # fmt: skip
-from processor.model.inputs import FLAG, Kind, Place, array, entry, hidden, number, shown, table, tables, text
+from processor.model.inputs import FLAG, Kind, Place, array, entry, hidden, number, table, tables, text
 from processor.scan_folder.file_values import FILE, FILE_UNIT, UNIT
 from processor.scan_folder.files import PROJECT
 from processor.scan_folder.guess import Guess
@@ -53,11 +52,10 @@ POSE = Kind(array(4, 4).expected, _pose, array(4, 4).schema)
 def _scanner(value: Any, place: Place) -> Instrument:
     if not isinstance(value, str) or not value:
         raise TypeError
-    if value in (classes := instruments.class_names()):
+    if value in instruments.class_names():
         return instruments.of_class(value)
     if not value.lower().endswith(".toml"):
-        expected = f"expected one of {', '.join(classes)}, or a scanner.toml below the folder"
-        raise place.refused(f"{expected}, found {shown(value)}{did_you_mean(value, classes)}")
+        raise place.refused(instruments.unknown(value))
     path = FILE.convert(value, place)
     return instruments.from_file(read_toml(path), Place(str(path)))
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from processor.model import UsageError
-from processor.model.inputs import Parameters, entry, number, text
-from processor.model.instruments import class_names
+from processor.model.inputs import Parameters, entry, number
 from processor.space_frame.members import member_extraction
 
 METHODS = ("ray", "ransac", "least-squares")  # the first is the default
@@ -39,8 +38,6 @@ class Params(Parameters, table="spheres"):
     min_points: int = entry(COUNT, default=20)
     # of spheres without members: the known radius, fixed; NaN = estimated
     radius_mm: float = entry(number(above=0, unknown=True), default=NAN)
-    # of spheres without members: the class of the scanner, phase, pulse or long-range; "" = not known, as of phase
-    instrument: str = entry(text("", *class_names()), default="")
     max_balls: int = entry(COUNT, default=10)  # without members: spheres to search for, in succession
 
     def check(self, has_design: bool) -> None:

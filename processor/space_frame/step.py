@@ -103,7 +103,7 @@ def _without_members(scene: Scene, params: Params, limits: Tolerance) -> Result:
     if not len(result.balls):
         return replace(result, method=params.method, reasons=(*before, *result.reasons))
     # Those of a search have it already.
-    of_view = scanner_class_errors.of_class(params.instrument if scene.frame is None else "").view_mm
+    of_view = scanner_class_errors.known().view_mm
     reasons = (*before, *result.reasons, reason("spheres.by-class", sd=of_view))
     balls = result.balls if scene.frame is None else _with_class(result.balls)
     return replace(result, method=params.method, reasons=reasons, balls=balls)

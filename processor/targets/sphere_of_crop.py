@@ -20,7 +20,16 @@ import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
 
-from processor.geometry.sphere import MINIMAL, Sphere, canonical_order, through_four, visible_fraction
+from processor import large_arrays
+from processor.geometry.sphere import (
+    MINIMAL,
+    Sphere,
+    algebraic,
+    canonical_order,
+    lengths,
+    through_four,
+    visible_fraction,
+)
 from processor.geometry.sphere_evidence import (
     ABOUT,
     BAND,
@@ -33,7 +42,7 @@ from processor.geometry.sphere_evidence import (
     inlier_share,
     rows_of_cells,
 )
-from processor.geometry.sphere_fit import LEAST_SCALE, WORST_CONDITION, RobustFit, robust_fit
+from processor.geometry.sphere_fit import LEAST_SCALE, RobustFit, robust_fit
 from processor.model import Floats, Ints
 from processor.robust_statistics import TUKEY, robust_sd
 from processor.space_frame.spheres.sphere_detection import Ball
@@ -58,15 +67,7 @@ MOST_FITTED = 20_000  # points that proposals are fitted to; the one taken is fi
 WIDER = 2.0  # times the noise of points inside: the largest scale of a fit to them
 
 
-@dataclass(frozen=True)
-class Found:
-    """The sphere of a crop, and whether it passes every test."""
-
-    ball: Ball
-    certain: bool
-
-
-def find(points: Floats, least_points: int, radius_mm: float | None, scanner: Floats | None) -> Found | None:
+def find(points: Floats, least_points: int, radius_mm: float | None, scanner: Floats | None) -> Ball | None:
     """Fit the sphere of a crop (n, 3), mm; None where nothing is like a sphere.
 
     ``radius_mm`` fixes the radius; ``scanner`` (n, 3) is the position each point was seen from. The result does not
@@ -135,7 +136,7 @@ class _Crop:
         if np.count_nonzero(beyond) < fewest:
             return rows, noise
         away = self.points - ball.centre
-        directions = away / np.linalg.norm(away, axis=1)[:, None]
+        directions = away / lengths(away)[:, None]
         nearest = cKDTree(directions[beyond]).query(directions[rows], k=[fewest])[0][:, 0]
         return rows[nearest > CLEAR], noise
 
@@ -177,32 +178,29 @@ def _whole(crop: _Crop, first: RobustFit, *, at_noise: bool) -> tuple[RobustFit,
     return replace(fit, sphere=fit.sphere.widened_by(moved, first.sphere.covariance)), Grade.CERTAIN
 
 
-def _in_place(crop: _Crop, fit: RobustFit, order: Ints, origin: Floats, *, certain: bool) -> Found:
+def _in_place(crop: _Crop, fit: RobustFit, order: Ints, origin: Floats, *, certain: bool) -> Ball:
     on = np.abs(fit.sphere.residuals(crop.points)) < TUKEY * fit.scale
     share = inlier_share(crop.points, replace(fit, inliers=on))
-    return Found(Ball(fit.in_place(len(order), order, origin), share), certain)
+    return Ball(fit.in_place(len(order), order, origin), share, certain)
 
 
 def _alone(crop: Floats, radius_mm: float | None) -> Iterator[tuple[Sphere, float]]:
     """Yield the sphere of least squares, with twice their scale, if nearly all points are on it."""
-    A = np.column_stack([2.0 * crop, np.ones(len(crop))])
-    normal = A.T @ A
-    if np.linalg.cond(normal) > WORST_CONDITION:
+    sphere = algebraic(crop)
+    if sphere is None:
         return
-    solution = np.linalg.solve(normal, A.T @ np.sum(crop**2, axis=1))
-    radius = float(np.sqrt(max(solution[3] + solution[:3] @ solution[:3], 0.0)))
     low, high = _radii(crop, radius_mm)
-    off = np.linalg.norm(crop - solution[:3], axis=1) - radius
+    off, radius = sphere.residuals(crop), sphere.radius
     sd = robust_sd(off)
     if low <= radius <= high and sd < 0.5 * BANDS[-1] * radius and np.mean(np.abs(off) < TUKEY * sd) >= ALONE:
-        yield Sphere(solution[:3], radius, np.zeros((4, 4))), max(WIDER * sd, LEAST_SCALE * radius)
+        yield sphere, max(WIDER * sd, LEAST_SCALE * radius)
 
 
 def _radii(crop: Floats, radius_mm: float | None) -> tuple[float, float]:
     """Return the least and the greatest radius of what may be the sphere of a crop."""
     if radius_mm is not None:
         return (1.0 - RADIUS_BAND) * radius_mm, (1.0 + RADIUS_BAND) * radius_mm
-    diagonal = float(np.linalg.norm(np.ptp(crop, axis=0)))
+    diagonal = float(np.linalg.norm(large_arrays.span(crop)))
     return SMALLEST * diagonal, LARGEST * diagonal
 
 
@@ -213,7 +211,7 @@ def _starts(
 
     Points are scored one per cell, so that places with many weigh no more than others.
     """
-    diagonal = float(np.linalg.norm(np.ptp(crop, axis=0)))
+    diagonal = float(np.linalg.norm(large_arrays.span(crop)))
     scored = crop[rows_of_cells(crop, diagonal / CELLS)]
     scored = np.ascontiguousarray(scored[:: len(scored) // MOST_SCORED + 1])
     if len(scored) < MINIMAL:

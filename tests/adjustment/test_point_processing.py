@@ -213,7 +213,7 @@ def test_intervals_hold_the_class_of_the_instrument(instrument, least):
 
 def test_an_instrument_of_no_known_class_is_refused():
     with pytest.raises(
-        ValueError, match=r"expected one of phase, pulse, long-range, or a scanner\.toml, got 'total station'"
+        ValueError, match=r"expected one of phase, pulse, long-range, or a scanner\.toml, found 'total station'"
     ):
         fit_sphere(ball(1), instrument="total station")
 

@@ -90,7 +90,7 @@ def test_a_fit_uses_the_noise_of_the_points_and_not_the_width_of_its_band():
     for seed in range(4):
         rng = np.random.default_rng(seed)
         points = (RADIUS + rng.normal(0.0, 1.5, (1000, 1))) * directions(rng, 1000)
-        scale = sphere_of_crop.find(points, 40, None, None).ball.fit.scale
+        scale = sphere_of_crop.find(points, 40, None, None).fit.scale
         # Of a ball alone all points agree: sd of a robust scale of 1000 points 4 %, four of them.
         assert scale == pytest.approx(1.5, rel=0.15)
 

@@ -23,6 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
+from processor import large_arrays
 from processor.adjustment.processing import sphere_smoothness
 from processor.geometry import coincident_points
 from processor.model import Floats, Ints, Reason, reason
@@ -117,7 +118,7 @@ def recognised(points: Floats, of_sphere: tuple[Floats, Floats] | None = None) -
         smoothed |= alike
     # The fourth neighbour of chance points is about twice as far as the first, which may be a copy.
     spacing = 0.5 * float(np.median(np.linalg.norm(patches[:, 4], axis=1)))
-    places = [points[of_place] - points[of_place].min(axis=0) for of_place in rows]
+    places = [points[of_place] - large_arrays.corners(points[of_place])[0] for of_place in rows]
     return Processing(step=step, cell=0.0 if smoothed else _cell(places, spacing), smoothed=smoothed, mesh=mesh)
 
 
@@ -138,7 +139,7 @@ def agreed(traces: Sequence[Processing]) -> list[Processing]:
 def _patches(place: Floats, size: int) -> Ints:
     """Return some points of a place and their nearest neighbours, ascending, as rows (m, size)."""
     sample = np.linspace(0, len(place) - 1, min(PATCHES, len(place))).astype(np.int64)
-    near: Ints = cKDTree(place).query(place[sample], k=size)[1]
+    near: Ints = cKDTree(place, **coincident_points.FEW).query(place[sample], k=size)[1]
     return near
 
 
@@ -211,8 +212,8 @@ def _cell(places: list[Floats], spacing: float) -> float:
     if not spacing > 0.0:
         return 0.0
     # A plane along two axes says nothing along the third, and where it lies between two cells both have points.
-    places = [np.where(np.ptp(place, axis=0) >= WIDE * spacing, place, 0.0) for place in places]
-    extent = max(float(np.ptp(place, axis=0).max()) for place in places)
+    places = [np.where(large_arrays.span(place) >= WIDE * spacing, place, 0.0) for place in places]
+    extent = max(float(large_arrays.span(place).max()) for place in places)
     if not extent > 0.0:
         return 0.0
     frequency, power = _periodogram(places, spacing, extent)
@@ -240,7 +241,7 @@ def _periodogram(places: list[Floats], spacing: float, extent: float) -> tuple[F
     bins = int(extent / width) + 1
     total, columns = np.zeros(0), 0
     for place in places:
-        for column in place.T[np.ptp(place, axis=0) > 0.0]:
+        for column in place.T[large_arrays.span(place) > 0.0]:
             columns += 1
             counts = np.bincount((column / width).astype(np.int64), minlength=bins)
             power = np.abs(np.fft.rfft(counts, 4 * bins)) ** 2 / len(place)

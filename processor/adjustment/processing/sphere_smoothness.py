@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from processor.geometry import coincident_points
 from processor.model import Floats, Ints
 
 PART_POINTS = 180  # about; from 90 on means of 8, and from 150 on those of 20 and moving least squares are told apart
@@ -38,7 +39,7 @@ def ratio(directions: Floats, errors: Floats) -> float:
     left[parts], part[parts] = off_second_order(errors[parts], v, w), np.arange(len(parts))[:, None]
     variance = np.sum(left[parts] ** 2, axis=1) / (parts.shape[1] - TERMS)
     rows = parts[:, :: max(1, parts.size // LOOKED_AT)].ravel()
-    near = cKDTree(directions).query(directions[rows], k=NEAREST)[1][:, 1:]
+    near = cKDTree(directions, **coincident_points.FEW).query(directions[rows], k=NEAREST)[1][:, 1:]
     within = part[near] == part[rows, None]
     squares = np.where(within, (left[near] - left[rows, None]) ** 2, 0.0)
     sums, pairs = (np.bincount(part[rows], one.sum(axis=1), len(parts)) for one in (squares, within))

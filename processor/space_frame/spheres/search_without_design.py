@@ -10,7 +10,7 @@ from processor.adjustment import residual_correlation, scanner_class_errors
 from processor.adjustment.processing import point_processing
 from processor.distinct_rows import distinct_points
 from processor.geometry import coincident_points
-from processor.geometry.sphere import Sphere, algebraic, sphere_cells
+from processor.geometry.sphere import Sphere, algebraic, lengths, sphere_cells
 from processor.geometry.sphere_fit import LEAST_SCALE, RobustFit, bound, robust_fit
 from processor.model import NORMAL_95, Floats, Reason, Status, Tolerance, reason
 from processor.robust_statistics import TUKEY, biweight
@@ -73,7 +73,7 @@ def _measured(found: list[sphere_detection.Ball], cloud: MergedCloud, params: Pa
     else:
         messages.append(reason("spheres.robust-ranges"))
     if params.method != "least-squares":
-        messages += by_class(params)
+        messages += by_class()
     radius = _held(params)
     if radius is not None:
         messages.append(reason("spheres.radius-held", radius=radius))
@@ -84,9 +84,9 @@ def _measured(found: list[sphere_detection.Ball], cloud: MergedCloud, params: Pa
     return _with_bounds(result, rows) if params.method == "ray" else result
 
 
-def by_class(params: Params) -> tuple[Reason, ...]:
+def by_class() -> tuple[Reason, ...]:
     """Return what is assumed of a scanner whose class is not stated."""
-    if params.instrument or scanner_class_errors.stated():
+    if scanner_class_errors.stated():
         return ()
     assumed = scanner_class_errors.known()
     return (reason("spheres.instrument-assumed", view=assumed.view_mm, incidence=assumed.incidence_mm),)
@@ -105,7 +105,7 @@ def fitted(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, param
     if sphere is None:
         return missing(id_, NAN, len(on), reason("spheres.no-sphere"))
     off = on - candidate.fit.sphere.centre
-    distance = np.linalg.norm(off, axis=1)
+    distance = lengths(off)
     trace = point_processing.recognised(on, (off / distance[:, None], distance - candidate.fit.sphere.radius))
     doubts: list[Reason] = []
     remarks = trace.reasons("points")
@@ -120,7 +120,7 @@ def fitted(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, param
             fitted = candidate.fit.sphere.covariance
             sphere = replace(widened, covariance=fitted + times * (widened.covariance - fitted))
         if _held(params) is not None:
-            moved, other_radius, doubted = _by_free_radius(cloud, candidate.fit, params.instrument)
+            moved, other_radius, doubted = _by_free_radius(cloud, candidate.fit)
             sphere = sphere.widened_by(moved)
             remarks, wrong = (*remarks, *other_radius), wrong or doubted
     row = assessed(id_, NAN, sphere, on, candidate.inlier_share, params, Tolerance())
@@ -136,7 +136,7 @@ def fitted(id_: int, candidate: sphere_detection.Ball, cloud: MergedCloud, param
     if params.method == "least-squares":
         return row
     free = 4 if _held(params) is None else 3
-    shared, stations = _by_neighbours_and_views(cloud, candidate.fit, free, params.instrument)
+    shared, stations = _by_neighbours_and_views(cloud, candidate.fit, free)
     return replace(
         row,
         sphere=replace(sphere, covariance=sphere.covariance + shared),
@@ -156,7 +156,7 @@ def _widened(cloud: MergedCloud, fit: RobustFit, radius_held: bool) -> Sphere | 
     """
     ball = fit.sphere
     off = cloud.points - ball.centre
-    distance = np.linalg.norm(off, axis=1)
+    distance = lengths(off)
     near = distance < sphere_detection.NEAR * ball.radius
     if cloud.scanner is None:
         side = np.mean(off[fit.inliers] / distance[fit.inliers, None], axis=0)
@@ -167,9 +167,7 @@ def _widened(cloud: MergedCloud, fit: RobustFit, radius_held: bool) -> Sphere | 
         seen_from: Floats = np.broadcast_to(far, (int(near.sum()), 3))
     else:
         seen_from = cloud.scanner - ball.centre
-        across = np.linalg.norm(np.cross(off, seen_from), axis=1) / np.maximum(
-            np.linalg.norm(off - seen_from, axis=1), 1e-300
-        )
+        across = lengths(np.cross(off, seen_from)) / np.maximum(lengths(off - seen_from), 1e-300)
         near &= across < np.sqrt(1.0 - STEEP_COS**2) * ball.radius
         seen_from = seen_from[near]
     start = replace(ball, centre=np.zeros(3))
@@ -181,7 +179,7 @@ def _widened(cloud: MergedCloud, fit: RobustFit, radius_held: bool) -> Sphere | 
     return ball.widened_by(start.moved_to(again.sphere), by_chance)
 
 
-def _by_neighbours_and_views(cloud: MergedCloud, fit: RobustFit, free: int, instrument: str) -> tuple[Floats, int]:
+def _by_neighbours_and_views(cloud: MergedCloud, fit: RobustFit, free: int) -> tuple[Floats, int]:
     """Return what a fit's covariance (4, 4) lacks: errors that neighbouring points share, and those of their views.
 
     The second is the number of views, 0 where it is not known.
@@ -190,7 +188,7 @@ def _by_neighbours_and_views(cloud: MergedCloud, fit: RobustFit, free: int, inst
     """
     on, added = fit.inliers, np.zeros((4, 4))
     J, away = fit.derivatives[on, :free], cloud.points[on] - fit.sphere.centre
-    normals = away / np.linalg.norm(away, axis=1)[:, None]
+    normals = away / lengths(away)[:, None]
     weights = biweight(fit.residuals[on] / (TUKEY * fit.scale))
     cells = sphere_cells(away, np.zeros(3))
     if len(np.unique(cells)) > MOST_CELLS:
@@ -199,24 +197,24 @@ def _by_neighbours_and_views(cloud: MergedCloud, fit: RobustFit, free: int, inst
     if cloud.scanner is None:
         side = normals.mean(axis=0)
         if np.linalg.norm(side) < LEAST_ONE_SIDED:
-            added[:free, :free] += scanner_class_errors.of_class(instrument).view_mm ** 2 * np.eye(free)
+            added[:free, :free] += scanner_class_errors.known().view_mm ** 2 * np.eye(free)
             return added, 0
         cosines = np.maximum(normals @ side / np.linalg.norm(side), GRAZING_COS)
-        errors = scanner_class_errors.view_errors(np.zeros(len(J)), cosines, np.zeros(len(J), np.int64), instrument)
+        errors = scanner_class_errors.view_errors(np.zeros(len(J)), cosines, np.zeros(len(J), np.int64))
         errors, stations = errors * cosines[:, None], 0  # along the normals
     else:
         seen_from = cloud.scanner[on]
         one = (seen_from == seen_from[0]).all()  # without the sort that several need
         view = np.zeros(len(J), np.int64) if one else distinct_points(seen_from)[1]
         stations = int(view.max()) + 1
-        ranges = np.linalg.norm(cloud.points[on] - seen_from, axis=1)
-        errors = scanner_class_errors.view_errors(ranges, 1.0 / fit.derivatives[on, 3], view, instrument)
+        ranges = lengths(cloud.points[on] - seen_from)
+        errors = scanner_class_errors.view_errors(ranges, 1.0 / fit.derivatives[on, 3], view)
     moved = np.linalg.solve(J.T @ J, J.T @ errors)
     added[:free, :free] += moved @ moved.T
     return added, stations
 
 
-def _by_free_radius(cloud: MergedCloud, fit: RobustFit, instrument: str) -> tuple[Floats, tuple[Reason, ...], bool]:
+def _by_free_radius(cloud: MergedCloud, fit: RobustFit) -> tuple[Floats, tuple[Reason, ...], bool]:
     """Return how far points move the centre of a fit with a held radius, (4,), the remark on it, and whether to doubt.
 
     A radius that is wrong by a little fits as well, with its centre elsewhere. So the radius is also estimated. The
@@ -225,7 +223,7 @@ def _by_free_radius(cloud: MergedCloud, fit: RobustFit, instrument: str) -> tupl
     """
     ball, nowhere = fit.sphere, np.zeros(4)
     off = cloud.points - ball.centre
-    near = np.linalg.norm(off, axis=1) < sphere_detection.NEAR * ball.radius
+    near = lengths(off) < sphere_detection.NEAR * ball.radius
     seen_from = None if cloud.scanner is None else cloud.scanner[near] - ball.centre
     crop, start = MergedCloud(off[near], cloud.origin + ball.centre, seen_from), replace(ball, centre=np.zeros(3))
     free = robust_fit(crop.points, start, FIRST_SCALE * fit.scale, None, seen_from)
@@ -238,7 +236,7 @@ def _by_free_radius(cloud: MergedCloud, fit: RobustFit, instrument: str) -> tupl
         return nowhere, (), False
     centre = np.sqrt(1.0 - (sd / away) ** 2) * np.append(moved[:3], 0.0)
     shift, measured = float(np.linalg.norm(moved[:3])), free_sphere.radius
-    by_view = scanner_class_errors.of_class(instrument).view_mm
+    by_view = scanner_class_errors.known().view_mm
     remark = reason("spheres.other-radius", radius=measured, ci95=NORMAL_95 * sd, held=ball.radius, shift=shift)
     return centre, (remark,) if away > CHANCE * sd else (), away > CHANCE * float(np.hypot(sd, by_view))
 

@@ -63,10 +63,11 @@ LEAST_SPREAD = 0.15  # of such a patch across its longest side, in its width: no
 
 @dataclass(frozen=True)
 class Ball:
-    """A ball in the cloud, and the share of the points around it that lie on it."""
+    """A ball in the cloud, the share of the points around it that lie on it, and whether it passes every test."""
 
     fit: RobustFit
     inlier_share: float
+    certain: bool = True
 
 
 class Cloud(NamedTuple):
@@ -366,6 +367,8 @@ def flat_noise(points: Floats, width: float) -> float:
     It is the scanner's noise where patches are flat, and more where they are not. The order of the points does not
     matter.
     """
+    if len(rows_of_cells(points, width)) < LEAST_FLAT:
+        return float("nan")
     cloud = points[canonical_order(points)]
     cloud = cloud - cloud.mean(axis=0)
     seeds = cloud[rows_of_cells(cloud, width)]
