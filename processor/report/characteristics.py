@@ -9,7 +9,7 @@ from processor.language.messages import Message, label, text
 from processor.limits.judging import Judged, JudgedLimits
 from processor.model import WORST_FIRST, StepRun, Verdict
 from processor.report.columns import columns
-from processor.report.table import NAN, Table
+from processor.report.table import NAN, Table, decimals
 
 FILE = "characteristics"
 RISKS = ("risk_accept", "risk_reject")
@@ -19,16 +19,6 @@ COLUMNS = columns(
 )  # fmt: skip
 OF_LIMITS = columns("limit", "of", "verdict", "value", "ci95", "least", "greatest", "unit", *RISKS, "clause")
 MOST_NAMED = 4  # of a summary of one or two lines
-NOTE = text(
-    "Worst first. Deviation is actual less nominal, ci95 the half-width of its 95 % interval, lower and upper the "
-    "deviations allowed; a dash is no bound, or not known. The risks are the probabilities that it is wrong to accept "
-    "and to reject."
-)
-NOTE_OF_LIMITS = text(
-    "± is the 95 % half-width, a dash is no bound or no number. Pass: the whole interval keeps the limit; fail: the "
-    "whole interval exceeds it; indeterminate: the limit lies within it, or the value is in doubt. With the decision "
-    "rule simple the value alone decides, with risk the probability that accepting or rejecting is wrong."
-)
 
 
 def worst_first(rows: Iterable[Judged]) -> list[Judged]:
@@ -54,11 +44,11 @@ def limit_table(limits: JudgedLimits | None, file: str) -> list[Table]:
         )
         for one in worst_first(limits.rows)
     )  # fmt: skip
-    return [Table(text("Compared with limits"), OF_LIMITS, rows, file, NOTE_OF_LIMITS, on_page=False)]
+    return [Table(text("Compared with limits"), OF_LIMITS, rows, file, on_page=False)]
 
 
-def table(judged: Sequence[Judged], remark: str | Message = "") -> Table:
-    """Tabulate characteristics, with a remark on them."""
+def table(judged: Sequence[Judged]) -> Table:
+    """Tabulate characteristics."""
     rows = tuple(
         (
             one.of, one.verdict, one.what, one.nominal, one.actual, one.value, one.ci95,
@@ -67,8 +57,7 @@ def table(judged: Sequence[Judged], remark: str | Message = "") -> Table:
         )
         for one in judged
     )  # fmt: skip
-    note = text("{note} {remark}", note=NOTE, remark=remark) if remark else NOTE
-    return Table(text("Characteristics"), COLUMNS, rows, FILE, note, on_terminal=False)
+    return Table(text("Characteristics"), COLUMNS, rows, FILE, on_terminal=False)
 
 
 def summary(judged: Iterable[Judged]) -> Message:
@@ -93,6 +82,31 @@ def summary(judged: Iterable[Judged]) -> Message:
 
 
 def _named(one: Judged) -> Message:
-    if not math.isfinite(one.value):
-        return one.of if isinstance(one.of, Message) else label(one.of)
-    return text("{id} {deviation:+.2f} {unit}", id=one.of, deviation=one.value, unit=one.unit)
+    return text("{id} {deviation}", id=one.of, deviation=with_interval(one.value, one.ci95, one.unit))
+
+
+def with_interval(value: float, half: float, unit: str, sign: str = "+") -> str:
+    """Write a deviation with its interval, "-5.98 ± 0.14 mm", or without one where it has none; a size has no sign."""
+    if not math.isfinite(value):
+        return ""
+    digits = decimals(half)
+    interval = f" ± {half:.{digits}f}" if math.isfinite(half) else ""
+    return f"{value:{sign}.{digits}f}{interval} {unit}".rstrip()
+
+
+def nearness(one: Judged) -> float:
+    """Return the share of its limit that a value with its interval takes."""
+    half = one.ci95 if math.isfinite(one.ci95) else 0.0
+    sides = ((one.value + half, one.high), (one.value - half, one.low))
+    return max((value / bound for value, bound in sides if math.isfinite(bound) and bound), default=0.0)
+
+
+def allowed(low: float, high: float) -> str:
+    """Write the bounds of a deviation: "± 2", "-1 / 2", "≤ 2"; nothing where a bound is not known."""
+    if math.isnan(low) or math.isnan(high) or (math.isinf(low) and math.isinf(high)):
+        return ""
+    if math.isinf(low):
+        return f"≤ {high:g}"
+    if math.isinf(high):
+        return f"≥ {low:g}"
+    return f"± {high:g}" if low == -high else f"{low:g} / {high:g}"

@@ -10,7 +10,8 @@ from processor.field_check.check import FieldCheck, Term, scanner_toml
 from processor.language.messages import Message, label, text
 from processor.model import Verdict
 from processor.report import templates, title_block, write_results
-from processor.report.page import BANNER, TONES
+from processor.report.headline import BANNER
+from processor.report.page import TONES
 from processor.results.fields_to_json import reason_json
 from processor.results.file_names import REPORT_PAGE, RESULTS_JSON
 from processor.results.to_json import text_of

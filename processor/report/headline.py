@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
-from processor.language.messages import Text, messages, text
-from processor.model import Clips, StepRun
+from processor.language.messages import Message, Text, messages, text
+from processor.model import Clips, StepRun, Verdict, worst
 from processor.pipeline import Execution
 from processor.report import characteristics, verdict_counts
-from processor.report.reports_of_steps import step_report
+from processor.report.reports_of_steps import characteristics_of, step_report
 
+BANNER = {
+    Verdict.PASS: text("PASS"),
+    Verdict.FAIL: text("FAIL"),
+    Verdict.INDETERMINATE: text("INDETERMINATE"),
+    Verdict.NONE: text("No verdict"),
+}
 TO_CONFIRM = "Limits of {sources}: to be confirmed against the published text before verdicts are relied on."
 
 
@@ -22,8 +28,19 @@ def clipped(clips: Clips) -> Text:
 
 
 def of_run(execution: Execution, lang: str = "en") -> str:
-    """Return the headlines of all steps on one line."""
-    return "; ".join(messages(lang).text(of_step(run)) for run, _ in execution.by_step())
+    """Return the answer on one line."""
+    return "; ".join(messages(lang).text(sentence) for sentence in answer(execution))
+
+
+def answer(execution: Execution) -> list[Message]:
+    """Return what was found, in sentences: the verdict with what fails by how much, then each step's headline."""
+    runs = [run for run, _ in execution.by_step()]
+    held = [one for run in runs for one in characteristics_of(execution.scene, run)]
+    headlines: list[Message] = [of_step(run) for run in runs]
+    verdict = worst(run.verdict for run in runs)
+    if not held or verdict is Verdict.NONE:
+        return headlines
+    return [text("{verdict}: {summary}", verdict=BANNER[verdict], summary=characteristics.summary(held)), *headlines]
 
 
 def of_step(run: StepRun) -> Text:

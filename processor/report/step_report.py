@@ -8,8 +8,10 @@ from typing import Any
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message, text
-from processor.model import Scene, Status, StepRun, Verdict
+from processor.limits.judging import Judged
+from processor.model import Scene, Status, StepRun
 from processor.pipeline import Execution
+from processor.report.sheet.picture import Callout
 from processor.report.style import Drawn
 from processor.report.table import Table
 
@@ -30,13 +32,10 @@ class StepReport:
     to_do: Callable[[Any], Iterable[Any]] = lambda _: ()
     why: Callable[[Any], Iterable[Any]] = lambda result: result.reasons
     limits: Callable[[Any], Iterable[Any]] = lambda _: ()
-    # Headings and texts beside the verdict, each with a verdict of its own where it has one.
-    further_verdicts: Callable[[Any], Sequence[tuple[Any, Any] | tuple[Any, Any, Verdict]]] = lambda _: []
     characteristics: Callable[[Scene, StepRun], list[Any]] = lambda *_: []  # what is compared with limits
-    characteristics_note: str | Message = ""
-    own_table: bool = False  # whether the step's own tables list the characteristics
-    live_figures: tuple[str, ...] = ()  # file names of the pictures that the live figures show as well
-    further_figures: tuple[str, ...] = ()  # file names of the pictures that stand among the further tables
+    unlimited: Callable[[Any], Sequence[Judged]] = lambda _: ()  # the largest deviations that nothing limits
+    callouts: Callable[[Scene, StepRun], Sequence[Callout]] = lambda *_: ()  # on the picture of the sheet
+    sheet_tables: Callable[[Scene, StepRun], list[Table]] = lambda *_: []  # further lists of the sheet
     files: Callable[[Execution, StepRun], dict[str, bytes]] = lambda *_: {}  # further files in OUT by name
     interactive_data: Callable[[Scene, Sequence[StepRun]], dict[str, Any] | None] = lambda *_: None
 

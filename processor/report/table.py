@@ -20,6 +20,9 @@ from processor.plain_text import printable, spreadsheet_text
 from processor.report.columns import Column, columns, given
 
 NAN = float("nan")
+MOST_DECIMALS = 4  # a tenth of a micrometre: no scanner tells more
+PLUS_MINUS = "±"  # heads half-widths beside their values
+JUDGED = ("nominal", "actual", "deviation", "value", "value_mm", "departure")  # have their interval in ci95
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,6 @@ class Table:
     units: tuple[str, ...] = ()
     on_page: bool = True
     on_terminal: bool = True
-    folded: bool = False  # on the page: among the further tables, which a reader opens
 
 
 def tabulate(title: str | Message, cells: Mapping[str, Any], file: str = "", note: Any = "", **shown: Any) -> Table:
@@ -115,13 +117,47 @@ def csv_cell(cell: Any) -> Any:
     return cell
 
 
-def shown(cell: Any) -> str:
-    """Write a cell for people, messages in English: three decimals, a dash for no number, no control characters."""
+def shown(cell: Any, digits: int = 3) -> str:
+    """Write a cell for people, messages in English: with decimals, a dash for no number, no control characters."""
     if isinstance(cell, Text | Reason | list | tuple):
         cell = messages("en").text(cell)
     if isinstance(cell, float | np.floating):
-        return "–" if not math.isfinite(cell) else f"{cell:.3f}"
+        return "–" if not math.isfinite(cell) else f"{round(float(cell), digits) + 0.0:.{digits}f}"  # no -0.00
     return printable(str(cell))
+
+
+def decimals(half_width: Any, otherwise: int = 2) -> int:
+    """Return how many decimals a value has whose interval has two digits (GUM 7.2.6): -5.98 ± 0.14, 12 ± 15."""
+    if not isinstance(half_width, float | np.floating) or not (math.isfinite(half_width) and half_width > 0.0):
+        return otherwise
+    return min(max(1 - math.floor(math.log10(float(f"{half_width:.1e}"))), 0), MOST_DECIMALS)
+
+
+def shown_rows(table: Table) -> Iterator[list[str]]:
+    """Yield the cells of each row as written for people: numbers with the digits that their intervals support."""
+    halves = _halves(table)
+    for row in table.rows:
+        yield [
+            shown(cell, decimals(row[half]) if half >= 0 else column.decimals)
+            for cell, column, half in zip(row, table.columns, halves, strict=True)
+        ]
+
+
+def _halves(table: Table) -> list[int]:
+    """Return for each column the column of its half-widths, itself where it has half-widths, -1 where none has them."""
+    rows = {column.name: i for i, column in enumerate(table.columns)}
+    return [next((rows[name] for name in _half_widths(column.name) if name in rows), -1) for column in table.columns]
+
+
+def _half_widths(name: str) -> Iterator[str]:
+    """Yield the names that the column of half-widths of a column may have."""
+    if "ci95" in name or name == "ci95":
+        yield name
+    else:
+        stem, unit = (name.removesuffix("_mm"), "_mm") if name.endswith("_mm") else (name, "")
+        yield from (f"ci95_{name}", f"{stem}_ci95{unit}")
+        if name in JUDGED:
+            yield f"ci95{unit}"
 
 
 def plain_text(table: Table, most: int = 40) -> str:
@@ -129,7 +165,7 @@ def plain_text(table: Table, most: int = 40) -> str:
     english = messages("en")
     cells = [
         list(map(printable, headings(table, english))),
-        *([shown(cell) for cell in row] for row in table.rows[:most]),
+        *itertools.islice(shown_rows(table), most),
     ]
     widths = [max(_width(row[i]) for row in cells) for i in range(len(table.columns))]
     lines = [printable(title(table, english))]
@@ -159,11 +195,13 @@ def heading(column: Column, catalogue: Messages, stated: Collection[str] = ()) -
 
 def headings(table: Table, catalogue: Messages) -> tuple[str, ...]:
     """Return the headings of the columns in a language, with units that neither title nor group states."""
+    of_columns = [(one, (*table.units, *units)) for _, members, units in _by_group(table) for one in members]
+    halves = _halves(table)
     return tuple(
-        heading(column, catalogue, (*table.units, *units))
-        for _, members, units in _by_group(table)
-        for column in members
-    )
+        PLUS_MINUS if i and halves[i - 1] == i and column.unit == table.columns[i - 1].unit
+        else heading(column, catalogue, stated)
+        for i, (column, stated) in enumerate(of_columns)
+    )  # fmt: skip
 
 
 def full_headings(table: Table, catalogue: Messages) -> tuple[str, ...]:

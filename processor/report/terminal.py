@@ -2,32 +2,42 @@
 
 from __future__ import annotations
 
-import math
 import textwrap
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.language.messages import Message, label, messages, text
-from processor.model import Status, StepRun, Verdict
+from processor.language.messages import Message, messages, text
+from processor.model import Status, StepRun
 from processor.pipeline import Execution
 from processor.plain_text import printable
 from processor.report import all_tables, headline
 from processor.report import table as report_table
-from processor.report.characteristics import limits_of, worst_first
 from processor.report.reports_of_steps import step_report
 
-MOST_LINES, LONGEST = 15, 200  # of a terminal of 24 lines; characters: two or three of these
+MOST_LINES, LONGEST = 15, 300  # of a terminal of 24 lines; characters: two to four of these
 TO_DO, REASONS, LIMITS = 4, 3, 3  # most lines of each step
 MORE = text("... more in the report; --verbose prints the tables")
 
 
 def lines(execution: Execution, report: ErrorReport, page: str) -> list[str]:
-    """Return at most MOST_LINES lines; the headline stands first, the path of the page last."""
-    middle = list(_middle(execution, report))
-    if len(middle) > MOST_LINES - 2:
-        middle = [*middle[: MOST_LINES - 3], MORE]
-    written = [textwrap.shorten(printable(messages("en").text(line)), LONGEST, placeholder=" ...") for line in middle]
-    return [printable(headline.of_run(execution)), *written, f"report: {page}"]
+    """Return at most MOST_LINES lines: the answer first, then what to do and why; last the files, and the page."""
+    answer, middle = [_short(one) for one in headline.answer(execution)], list(_middle(execution, report))
+    files = _files(Path(page))
+    room = MOST_LINES - len(answer) - len(files) - 1
+    if len(middle) > room:
+        middle = [*middle[: room - 1], MORE]
+    return [*answer, *map(_short, middle), *files, f"report: {page}"]
+
+
+def _short(line: Message) -> str:
+    return textwrap.shorten(printable(messages("en").text(line)), LONGEST, placeholder=" ...")
+
+
+def _files(page: Path) -> list[str]:
+    """Name what lies beside the page; nothing where it has not been written."""
+    beside = sorted(one.name + "/" * one.is_dir() for one in page.parent.iterdir()) if page.is_file() else []
+    return [f"{page.parent}: {', '.join(map(printable, beside))}"] if beside else []
 
 
 def verbose(execution: Execution, report: ErrorReport, page: str) -> Iterator[str]:
@@ -55,8 +65,6 @@ def _middle(execution: Execution, report: ErrorReport) -> Iterator[Message]:
     if (to_confirm := headline.to_confirm(execution)) is not None:
         yield to_confirm
     for run in firsts:
-        yield from _beyond_limits(run)
-    for run in firsts:
         for sentence in list(step_report(run.step).to_do(run.result))[:TO_DO]:
             yield text("to do: {sentence}", sentence=sentence)
     for run in firsts:
@@ -75,31 +83,3 @@ def _middle(execution: Execution, report: ErrorReport) -> Iterator[Message]:
 
 def _reasons(run: StepRun) -> Sequence[Message]:
     return list(step_report(run.step).why(run.result))
-
-
-def _beyond_limits(run: StepRun) -> Iterator[Message]:
-    """Yield the comparisons that did not pass, the worst first."""
-    limits = limits_of(run)
-    if limits is None:
-        return
-    rows = [one for one in worst_first(limits.rows) if one.verdict != Verdict.PASS]
-    for one in rows[:LIMITS]:
-        yield text(
-            "{verdict}: {of}, {what}: {value} ± {ci95} {unit}, {allowed}",
-            verdict=one.verdict, of=one.of, what=label(one.what), value=one.value, ci95=one.ci95, unit=one.unit,
-            allowed=_allowed(one.low, one.high),
-        )  # fmt: skip
-    if len(rows) > LIMITS:
-        yield text("... and {count} more of {step}", count=len(rows) - LIMITS, step=step_report(run.step).title)
-
-
-def _allowed(low: float, high: float) -> Message:
-    if math.isnan(low) or math.isnan(high):
-        return text("allowed by a size that is not known")
-    if math.isinf(low):
-        return text("at most {high} allowed", high=high)
-    return (
-        text("at least {low} allowed", low=low)
-        if math.isinf(high)
-        else text("{low} to {high} allowed", low=low, high=high)
-    )

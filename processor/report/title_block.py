@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -29,13 +30,16 @@ def of(scene: Scene, provenance: Mapping[str, Any]) -> dict[str, Any]:
     rows: list[tuple[Message, Message | str]] = [
         (LABELS.get(key) or label(key.replace("_", " ")), value) for key, value in given.items() if key not in elsewhere
     ]
+    if math.isfinite(scene.temperature_C):
+        rows.append((text("Steel while it was scanned"), f"{scene.temperature_C:g} °C"))
+    if scene.tolerance is not None and scene.tolerance.standard:
+        rows.append((text("Standard"), scene.tolerance.standard))
     rows += [(text("Instrument"), instrument(scene)), *facts(provenance)]
-    signed = scene.title_block is not None
     return {
         "company": given.get(COMPANY, ""),
         "logo": _address(scene),
         "rows": rows,
-        "signatures": [(who, given.get(key, "")) for who, key in SIGNATURES] if signed else [],
+        "signatures": [(who, given.get(key, "")) for who, key in SIGNATURES],
     }
 
 

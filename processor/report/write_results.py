@@ -11,6 +11,7 @@ from processor.pipeline import Execution
 from processor.report import all_figures, all_tables, headline, page, pdf_report, workbook
 from processor.report import table as report_table
 from processor.report.reports_of_steps import step_report
+from processor.report.sheet import content as sheet_content
 from processor.report.style import default_settings
 from processor.results.file_names import FIGURES, JOB_RECORD, REPORT_PAGE, RESULTS_H5, RESULTS_JSON, STEPS
 from processor.results.to_json import results_json, text_of
@@ -21,6 +22,7 @@ from processor.writers import step_clouds
 # The record of a batch's job is replaced with its results: without it, the batch does the job again.
 OWN_NAMES = (RESULTS_JSON, RESULTS_H5, REPORT_PAGE, FIGURES, JOB_RECORD, STEPS)
 OWN_ENDINGS = (".csv", ".dxf", ".pdf", ".xlsx")
+STRUCTURE = "structure.png"  # the picture of the sheet
 FURTHER = ("pdf", "xlsx")  # forms of the report that are written on request
 
 
@@ -61,14 +63,18 @@ def write_results(
             for name, data in step_report(run.step).files(execution, run).items():
                 (making / name).write_bytes(data)
         drawn = all_figures.draw_figures(execution, report)
-        if any(of_step.figures for of_step in drawn.values()):
+        with default_settings():
+            sheet = sheet_content.of(execution)
+        if sheet.picture or any(of_step.figures for of_step in drawn.values()):
             (making / FIGURES).mkdir()
+        if sheet.picture:
+            (making / FIGURES / STRUCTURE).write_bytes(sheet.picture)
         for of_step in drawn.values():
             for name, (_, png) in of_step.figures.items():
                 (making / FIGURES / name).write_bytes(png)
             for name, data in of_step.documents.items():
                 (making / name).write_bytes(data)
-        (making / REPORT_PAGE).write_text(page.html(execution, report, drawn, lang), "utf-8")
+        (making / REPORT_PAGE).write_text(page.html(execution, report, drawn, lang, sheet), "utf-8")
         if execution.clouds:
             stages = [
                 step_clouds.OfRun(
@@ -82,6 +88,6 @@ def write_results(
             step_clouds.write(making / STEPS, stages)
         if "pdf" in further:
             with default_settings():
-                (making / pdf_report.NAME).write_bytes(pdf_report.document(execution, drawn, lang))
+                (making / pdf_report.NAME).write_bytes(pdf_report.document(execution, sheet, lang))
         if "xlsx" in further:
             (making / workbook.NAME).write_bytes(workbook.workbook(execution, report))

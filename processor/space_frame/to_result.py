@@ -156,7 +156,7 @@ def _status(balls: Balls, matched: Matching | None) -> Status:
     missing = balls.flagged(Flag.NOT_FOUND)
     if missing.all():
         return Status.FAILED
-    complete = not missing.any() and (matched is None or matched.status is Status.OK)
+    complete = not missing.any() and balls.flagged(Flag.OK).any() and (matched is None or matched.status is Status.OK)
     return Status.OK if complete else Status.PARTIAL
 
 

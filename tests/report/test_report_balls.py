@@ -22,7 +22,6 @@ from processor.pipeline import Execution
 from processor.report import all_figures, all_tables, page, write_results
 from processor.report.columns import columns
 from processor.report.space_frame import ball_picture, dxf, flagged_ball_figures, interactive_view, section
-from processor.report.space_frame import figures as space_frame_figures
 from processor.report.space_frame import tables as space_frame_tables
 from processor.report.style import COLOURS, DPI, Drawn
 from processor.results import to_json
@@ -344,19 +343,15 @@ def compared():
 def test_figures_of_a_frame_and_those_of_balls_to_look_at(compared):
     found = compared[2]["spheres"].figures
     assert set(found) == {
-        "plan.png", "radius-errors.png", "ball-errors.png", "flagged-ball-11.png", "flagged-ball-12.png",
-        "flagged-ball-13.png",
+        "plan.png", "radius-errors.png", "flagged-ball-11.png", "flagged-ball-12.png", "flagged-ball-13.png",
     }  # fmt: skip
     assert "times their size" in str(found["plan.png"][0])
-    assert "minus truth" in str(found["ball-errors.png"][0])
-    assert "sd" not in str(found["ball-errors.png"][0])
     assert str(found["flagged-ball-11.png"][0]).startswith("Ball 11, wrong-size")
 
 
 def test_points_that_are_not_at_hand_leave_the_pictures_of_balls_out():
     found = all_figures.draw_figures(*of_frame(points=np.empty((0, 3))))["spheres"].figures
-    assert set(found) == {"plan.png", "ball-errors.png"}
-    assert "Standard deviations" in str(found["ball-errors.png"][0])  # there is no truth to compare with
+    assert set(found) == {"plan.png"}
 
 
 def test_few_balls_have_a_picture_worst_first_and_all_a_page(monkeypatch):
@@ -493,14 +488,6 @@ def test_targets_without_members_have_lowest_points_and_bounds():
     assert any(one.on_terminal and columns("radius_mm")[0] in one.columns for one in found.values())
 
 
-def test_expected_distribution_integrates_to_the_number_of_errors():
-    x = np.linspace(-5.0, 5.0, 1001)
-    y = space_frame_figures._mixture(x, np.array([0.2, 0.5, NAN, 0.0]), 0.1)
-    assert y.sum() * (x[1] - x[0]) / 0.1 == pytest.approx(2.0, abs=1e-6)  # a smooth density in steps of sd / 20
-    assert y[500] == pytest.approx(0.1 * (1 / 0.2 + 1 / 0.5) / math.sqrt(2.0 * math.pi))
-    assert space_frame_figures._mixture(x, np.array([NAN]), 0.1) is None
-
-
 def test_designed_places_are_transformed_into_the_scan():
     T = pose(TURN, (7e5, -2e5, 100.0))
     made = whole(T=T)
@@ -517,8 +504,15 @@ def test_the_page_of_a_frame(compared):
         found.tables
     )
     assert found.tables["Nodes against the design (mm)"][1][-3] == "pass"
-    assert len([one for one in found.addresses if one.startswith("data:image/png")]) == len(drawn["spheres"].figures)
-    assert "Nodes against the design" in text[text.index("<h2>") :]
+    assert len([one for one in found.addresses if one.startswith("data:image/png")]) == 1 + len(
+        drawn["spheres"].figures
+    )
+    assert "Nodes against the design" in text[text.index('class="appendix"') :]
+    head, first, *_ = found.tables["Balls: coordinates, lowest points, movements"]
+    assert head[:9] == ["id", "x (m)", "y (m)", "z (m)", "± (mm)", "radius (mm)", "±", "lowest z (m)",
+                        "± (mm)"]  # fmt: skip
+    ball = execution.runs[0].result.balls
+    assert first[:4] == [str(ball.names[0]), *(f"{value / 1000.0:.4f}" for value in ball.centres[0])]
 
 
 @pytest.mark.parametrize("times", [500, pytest.param(6000, marks=pytest.mark.slow)])

@@ -9,15 +9,20 @@ import zlib
 import numpy as np
 import pytest
 from matplotlib import font_manager
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import messages
 from processor.model import TitleBlock
 from processor.report import all_tables, pdf_report, style, workbook
-from processor.report.style import Drawn, default_settings
+from processor.report.columns import columns
+from processor.report.sheet import content
+from processor.report.style import default_settings
+from processor.report.table import Table, shown_rows
 from tests.support.results.bridge_results import of_bridge
 
+NAN = float("nan")
 FORMULAS = ("=1+1", "+1", "-1", "@SUM(A1)")
 
 
@@ -27,23 +32,21 @@ def signed(names=("foot1", "rib1", "foot2")):
     return dataclasses.replace(execution, scene=dataclasses.replace(execution.scene, title_block=block))
 
 
-def written(execution):
-    """The document of an execution, with two figures of a pixel."""
-    one = io.BytesIO()
-    Image.new("RGB", (1, 1)).save(one, "PNG")
-    figures = {"preassemble": Drawn({f"{name}.png": (f"Caption of {name}", one.getvalue()) for name in "ab"})}
+def written(execution, lang="en"):
+    """The sheet of an execution."""
     with default_settings():
-        return pdf_report.document(execution, figures)
+        return pdf_report.document(execution, content.of(execution), lang)
 
 
-def test_the_document_has_a_page_a_figure_and_the_same_bytes_again(drawn_pictures):
+def test_the_sheet_has_few_pages_and_the_same_bytes_again(drawn_pictures):
     execution = signed()
     first = written(execution)
     assert first == written(execution)
-    assert len(re.findall(rb"/Type /Page\b(?!s)", first)) == 2 + 2  # two of text, and one a figure
+    assert 1 <= len(re.findall(rb"/Type /Page\b(?!s)", first)) <= 4
     assert not re.search(rb"/(CreationDate|ModDate)", first)
-    content = b"".join(zlib.decompress(part) for part in re.findall(rb"stream\r?\n(x.*?)\r?\nendstream", first, re.S))
-    assert b"CreationDate" not in content
+    parts = re.findall(rb"stream\r?\n(x.*?)\r?\nendstream", first, re.S)
+    streams = b"".join(zlib.decompressobj().decompress(part) for part in parts)
+    assert b"CreationDate" not in streams
 
 
 def test_a_workbook_holds_the_tables_as_numbers_and_text():
@@ -89,8 +92,15 @@ def a_chinese_font(monkeypatch):
     style._has.cache_clear()
 
 
-def front(execution, lang):
-    return next(iter(pdf_report._front(execution, messages(lang))))
+def pages_of(execution, lang="en"):
+    """The pages of the sheet as figures."""
+    pages = pdf_report.Pages(messages(lang))
+    sheet = content.of(execution)
+    pdf_report._front(pages, execution, sheet)
+    for table in (*sheet.first, *sheet.further):
+        pages.table(table, lang)
+    pdf_report._end(pages, execution, sheet)
+    return pages.pages
 
 
 def texts_of(page):
@@ -99,13 +109,11 @@ def texts_of(page):
 
 def test_document_is_chinese_if_a_font_is_installed(a_chinese_font, drawn_pictures):
     execution = signed()
-    seen = texts_of(front(execution, "zh"))
+    seen = [said for page in pages_of(execution, "zh") for said in texts_of(page)]
     assert any("桥 Meyer" in one for one in seen)
     assert any(one.startswith("批准") for one in seen)
     assert not any("?" in one for one in seen)
-    with default_settings():
-        data = pdf_report.document(execution, {}, "zh")
-    assert b"LastResort" in data
+    assert b"LastResort" in written(execution, "zh")
 
 
 def test_document_without_a_font_is_english_with_question_marks(monkeypatch, drawn_pictures):
@@ -113,23 +121,48 @@ def test_document_without_a_font_is_english_with_question_marks(monkeypatch, dra
         monkeypatch.setattr(module, "chinese_font", lambda: "")
     style._has.cache_clear()
     execution = signed()
-    with default_settings():
-        assert pdf_report.document(execution, {}, "zh") == pdf_report.document(execution, {}, "en")
-    assert any("? Meyer" in one for one in texts_of(front(execution, "en")))
+    assert written(execution, "zh") == written(execution, "en")
+    assert any("? Meyer" in one for page in pages_of(execution) for one in texts_of(page))
     style._has.cache_clear()
 
 
 def test_the_logo_stands_on_the_first_page_in_its_proportions():
     execution = signed()
-    assert front(execution, "en").axes == []
+    (picture,) = pages_of(execution)[0].axes
     out = io.BytesIO()
     Image.new("RGB", (300, 60), "navy").save(out, "PNG")
     block = dataclasses.replace(execution.scene.title_block, logo=np.frombuffer(out.getvalue(), np.uint8))
-    page = front(dataclasses.replace(execution, scene=dataclasses.replace(execution.scene, title_block=block)), "en")
-    (axes,) = page.axes
-    box = axes.get_position()
-    assert box.width * pdf_report.A4[0] / (box.height * pdf_report.A4[1]) == pytest.approx(5.0)
-    assert box.x1 == pytest.approx(pdf_report.RIGHT)
+    execution = dataclasses.replace(execution, scene=dataclasses.replace(execution.scene, title_block=block))
+    logo, again = (one.get_position() for one in pages_of(execution)[0].axes)
+    wide, high = pdf_report.PAGE
+    assert logo.width * wide / (logo.height * high) == pytest.approx(5.0)
+    assert logo.x1 * wide == pytest.approx(pdf_report.LEFT + pdf_report.WIDTH)
+    assert again.width == pytest.approx(picture.get_position().width)
+
+
+@pytest.mark.parametrize("scale", [1.0, 400.0])
+def test_nothing_on_a_page_lies_over_anything_else_or_beyond_the_edge(scale, drawn_pictures):
+    """Texts as drawn, of names of usual and of any length: each within the margins, and clear of the others."""
+    names = ("foot1", "rib1 " * int(scale), "end-diagonal-difference-of-the-second-end")
+    for page in pages_of(signed(names=names)):
+        FigureCanvasAgg(page).draw()
+        width, height = page.canvas.get_width_height()
+        boxes = [one.get_window_extent() for one in page.texts if one.get_text().strip()]
+        for k, box in enumerate(boxes):
+            assert box.x0 > 0.04 * width
+            assert box.x1 < 0.96 * width
+            assert box.y0 > 0.02 * height
+            inner = box.padded(-1.0)  # of a pixel: descenders touch the line below
+            for other in boxes[:k]:
+                assert not inner.overlaps(other.padded(-1.0)), (page.texts[k].get_text(), scale)
+
+
+@pytest.mark.parametrize(
+    ("half", "wanted"), [(0.10, "0.06"), (0.0996, "0.06"), (0.14, "0.06"), (15.0, "0"), (1.5, "0.1"), (NAN, "0.06")]
+)
+def test_digits_follow_the_interval(half, wanted):
+    table = Table("t", columns("deviation", "ci95"), ((0.06, half),))
+    assert next(iter(shown_rows(table)))[0] == wanted
 
 
 @pytest.mark.parametrize(
@@ -142,4 +175,5 @@ def test_the_logo_stands_on_the_first_page_in_its_proportions():
     ],
 )
 def test_lines_are_broken_at_spaces_and_between_chinese_characters(text, lines):
-    assert pdf_report.lines_of(text, 8) == lines
+    wide = 4.2 * 8.0 * 25.4 / 72.0  # mm: four characters of full width at 8 points
+    assert pdf_report.lines_of(text, wide, 8.0) == lines

@@ -37,17 +37,10 @@ WHAT_TO_DO = (
     *under(text("largest rotation"), "rotation_mrad", "rotation_ci95_mrad", "rotation_about"),
     *under(text("probability that all limits hold"), "probability_now", "probability_after"),
 )
-PROPOSAL = 2  # column of WHAT_TO_DO
 _NOTE = text(
     "± is the 95 % half-width. Groove gap: right part minus left along the bridge, positive is open. Pass: the whole "
     "interval keeps the limit; fail: the whole interval exceeds it; indeterminate: the limit lies within it. "
     "Probabilities: as it is, and after the proposed work."
-)
-LIMITS_NOTE = text("Least and greatest allowed; a dash is no bound, or one that depends on a size that is not known.")
-CHAIN_NOTE = text(
-    "Span and length of a unit: the distance of the outer ends, less the design's. Inner arc, axis and elevation: the "
-    "bottom edges at all chainages, of which the one nearest to its limit is shown, its interval widened for their "
-    "number; height at the same place of the span. Probabilities are of single values."
 )
 BUDGET_NOTE = text(
     "Standard deviations of one coordinate. Of the ends as measured: the median over all coordinates of key points, "
@@ -78,7 +71,13 @@ def adjusted(result: Result, method: str) -> list[Table]:
     if adjustment is None:
         return []
     return [
-        *_what_to_do(adjustment, method),
+        Table(
+            text("Joints: what to do, method {method}", method=method),
+            WHAT_TO_DO,
+            tuple(_joint_rows(adjustment)),
+            file=TO_DO,
+            note=_NOTE,
+        ),
         _limits(adjustment, method),
         *_chain(adjustment, method),
         _measures(adjustment, method),
@@ -90,7 +89,6 @@ def adjusted(result: Result, method: str) -> list[Table]:
             tuple(zip(BudgetSource, adjustment.budget_sd.tolist(), strict=False)),
             file="budget",
             note=BUDGET_NOTE,
-            folded=True,
         ),
         Table(
             text("What limits the accuracy, and which scan would help"),
@@ -100,32 +98,10 @@ def adjusted(result: Result, method: str) -> list[Table]:
                 (text("which scan would help"), text("{reasons:;}", reasons=adjustment.advice)),
             ),
             file="accuracy",
-            on_page=False,
         ),
         *_candidates(result, adjustment),
         _trade_off(result, adjustment, method),
     ]
-
-
-def _what_to_do(adjustment: Adjustment, method: str) -> list[Table]:
-    """Tabulate the proposals with the measures they are made from; on the terminal apart."""
-    title = text("Joints: what to do, method {method}", method=method)
-    rows = tuple(_joint_rows(adjustment))
-    proposals = tuple((row[0], row[PROPOSAL]) for row in rows)
-    return [
-        Table(title, WHAT_TO_DO, rows, file=TO_DO, note=_NOTE, on_terminal=False),
-        Table(
-            title,
-            _without_proposal(WHAT_TO_DO),
-            tuple(map(_without_proposal, rows)),
-            on_page=False,
-        ),
-        Table(text("Proposals"), columns("joint", "proposal"), proposals, on_page=False),
-    ]
-
-
-def _without_proposal(row: tuple[Any, ...]) -> tuple[Any, ...]:
-    return row[:PROPOSAL] + row[PROPOSAL + 1 :]
 
 
 def _joint_rows(adjustment: Adjustment) -> Iterator[tuple[Any, ...]]:
@@ -146,7 +122,7 @@ def _limits(adjustment: Adjustment, method: str) -> Table:
     joints = [joint for joint, one in zip(adjustment.joints.name, limits, strict=True) for _ in one.key]
     cells = {"joint": joints, **_cells_of_limits(JudgedLimits.concat(limits))}
     title = text("Limits, method {method}", method=method)
-    return tabulate(title, cells, LIMITS, LIMITS_NOTE, units=MM, on_page=False)
+    return tabulate(title, cells, LIMITS, units=MM, on_page=False)
 
 
 def _cells_of_limits(limits: JudgedLimits) -> dict[str, Any]:
@@ -168,7 +144,7 @@ def _chain(adjustment: Adjustment, method: str) -> Iterator[Table]:
     if len(limits):
         further = {"edition": limits.edition, "source": list(map(label, limits.source))}
         title = text("Limits of the whole chain, method {method}", method=method)
-        yield tabulate(title, {**_cells_of_limits(limits), **further}, CHAIN, CHAIN_NOTE, units=MM, on_page=False)
+        yield tabulate(title, {**_cells_of_limits(limits), **further}, CHAIN, units=MM, on_page=False)
     if adjustment.unused_limits:
         yield tabulate(
             text("Limits that nothing is compared with"),
@@ -218,14 +194,14 @@ def _measures(adjustment: Adjustment, method: str) -> Table:
         "unit": every.unit,
     }
     title = text("Measures of the joints, method {method}", method=method)
-    return tabulate(title, cells, "measures", on_terminal=False, folded=True)
+    return tabulate(title, cells, "measures", on_terminal=False)
 
 
 def _span_and_closure(adjustment: Adjustment, method: str) -> Table:
     values = np.append(adjustment.span_departure, adjustment.closure)
     cells = _departures((text("span"), *CLOSURE), ("mm", *CLOSURE_UNITS), values,
                         np.append(adjustment.span_ci95, adjustment.closure_ci95))  # fmt: skip
-    return tabulate(text("Span and closure, method {method}", method=method), cells, "span", SPAN_NOTE, folded=True)
+    return tabulate(text("Span and closure, method {method}", method=method), cells, "span", SPAN_NOTE)
 
 
 def _departures(figures: Sequence[Message], units: Sequence[str], values: Floats, ci95: Floats) -> dict[str, Any]:
@@ -268,5 +244,4 @@ def _trade_off(result: Result, adjustment: Adjustment, method: str) -> Table:
         note=text("The result was made with lambda {weight:g}.", weight=adjustment.weight),
         units=MM,
         on_terminal=False,
-        folded=True,
     )

@@ -22,10 +22,6 @@ LIMITS = {
 }
 GROOVE_GAP, CHORDS = "groove_gap", ("span", "unit_length")
 CHAIN = text("chain")
-NOTE = text(
-    "Span and length of a unit: the distance of the outer ends. Inner arc, axis and elevation: the bottom edges at all "
-    "chainages, of which the one nearest to its limit is shown, its interval widened for their number."
-)
 
 
 def of_run(scene: Scene, run: StepRun) -> list[Judged]:

@@ -7,17 +7,19 @@ from typing import Any
 
 import numpy as np
 
+from processor.geometry.m3c2 import Z95
 from processor.language.messages import text
 from processor.model import KEY_POINTS, Floats, Scene, StepRun
 from processor.preassembly.result import Result
-from processor.report.preassembly import residual_map
+from processor.report.charts.surface_view import spacing
 from processor.report.preassembly.part_lines import part_lines
-from processor.report.preassembly.residual_map import PartMap
-from processor.report.style import DIVERGING_STOPS
+from processor.report.style import DIVERGING_STOPS, LEAST_SHOWN_MM, colour_limit
 from processor.report.table import shown
+from processor.robust_statistics import MAD_TO_SD
 from processor.store.json_values import json_ready
 
 MOST_POINTS = 24_000  # of all parts: about 0.6 MB of the page
+CELL = 2.5  # times the spacing of points: a cell's median has 0.5 of the noise of a point
 MOST_ON_AN_EDGE = 80  # drawn size: a curve is smooth with as many
 MOST_CHAINAGES = 3_000  # drawn size: more than a screen has pixels across
 
@@ -27,10 +29,9 @@ def interactive_data(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | 
     if scene.arch is None or not scene.arch.parts:
         return None
     result: Result = runs[0].result
-    drawn = residual_map.maps(scene, result)
-    points = sum(len(one.points) for one in drawn)
-    of_name = {one.name: one for one in drawn}
-    band = residual_map.scatter_band(drawn)
+    drawn = _residuals(result)
+    medians = np.concatenate([np.empty(0), *(values for _, values, _ in drawn.values())])
+    grey = max([LEAST_SHOWN_MM, *(scatter for _, _, scatter in drawn.values())])
     trade = result.trade_off
     view = {
         "title": text("Gaps and residuals in space") if drawn else text("Gaps in space"),
@@ -39,7 +40,7 @@ def interactive_data(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | 
         "method": runs[0].method,
         "keys": KEY_POINTS,
         "stops": DIVERGING_STOPS,
-        "parts": [_part(scene, i, of_name, points) for i in range(len(scene.arch.parts))],
+        "parts": [_part(scene, i, drawn, len(medians)) for i in range(len(scene.arch.parts))],
         "joints": [
             {
                 "name": shown(name),
@@ -50,8 +51,8 @@ def interactive_data(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | 
             }
             for j, name in enumerate(result.joints.name)
         ],
-        "limit": residual_map.colour_steps(drawn, band)[2][-1] if drawn else 1.0,
-        "grey": band.high,
+        "limit": max(colour_limit(medians), 2.0 * grey) if drawn else 1.0,
+        "grey": grey,
         "linear": [
             _linear(run)
             for k, run in enumerate(runs)
@@ -70,7 +71,35 @@ def interactive_data(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | 
     return made
 
 
-def _part(scene: Scene, i: int, drawn: dict[str, PartMap], points: int) -> dict[str, Any]:
+def _residuals(result: Result) -> dict[str, tuple[Floats, Floats, float]]:
+    """Return for each part with distances from its design its points (n, 3), the medians (n,) of their cells.
+
+    Also the half-width of the 95 % interval of a median by the scatter of the points about it: sqrt(pi / 2 m) sd of m.
+    """
+    if result.adjustment is None:
+        return {}
+    residuals, found = result.adjustment.residuals, {}
+    for i, name in enumerate(result.components.name):
+        rows = (residuals.component == i) & np.isfinite(residuals.distance)
+        points, values = residuals.points[rows], residuals.distance[rows]
+        if not len(points):
+            continue
+        cell = np.floor(points / max(CELL * spacing(points), LEAST_SHOWN_MM)).astype(np.int64)
+        of = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
+        order = np.lexsort((values, of))
+        count = np.bincount(of)
+        first = np.cumsum(count) - count
+        medians = 0.5 * (values[order[first + (count - 1) // 2]] + values[order[first + count // 2]])
+        share = float((1.0 / count[of]).mean())  # of a point in its median, by which it lies too near
+        off = np.abs(values - medians[of])
+        off = off[off > 0.0]  # the point that is the median tells nothing
+        sd = MAD_TO_SD * float(np.median(off)) / np.sqrt(1.0 - share) if len(off) else 0.0
+        half = float(Z95 * sd * np.sqrt(0.5 * np.pi * share))
+        found[name] = points, medians[of], half
+    return found
+
+
+def _part(scene: Scene, i: int, drawn: dict[str, tuple[Floats, Floats, float]], points: int) -> dict[str, Any]:
     """Return the lines of a part, and its share of MOST_POINTS of all ``points`` with the medians of their cells."""
     assert scene.arch is not None
     name = scene.arch.parts[i].name
@@ -78,10 +107,8 @@ def _part(scene: Scene, i: int, drawn: dict[str, PartMap], points: int) -> dict[
     if name not in drawn:
         return part | {"points": [], "residual": []}
     rows = slice(None, None, max(1, -(-points // MOST_POINTS)))
-    return part | {
-        "points": np.rint(drawn[name].points[rows]).astype(int).ravel(),
-        "residual": np.round(drawn[name].of_points[rows], 3),
-    }
+    near, medians, _ = drawn[name]
+    return part | {"points": np.rint(near[rows]).astype(int).ravel(), "residual": np.round(medians[rows], 3)}
 
 
 def _thinned(edge: Floats) -> Floats:

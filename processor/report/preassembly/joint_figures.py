@@ -1,4 +1,4 @@
-"""Figures of the gaps at every joint: the section with arrows across it, and all methods beside each other."""
+"""Figure of the gaps at every joint: the section with arrows across it."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse, Polygon
 
 from processor.language.messages import Message, text
-from processor.model import KEY_POINTS, NORMAL_95, Bools, Floats, StepRun
+from processor.model import KEY_POINTS, NORMAL_95, Floats
 from processor.preassembly.chain.joint_measures import RAYLEIGH_95, Measures
 from processor.preassembly.result import Result
-from processor.report.style import BEHIND_TEXT, COLOURS, LEAST_SHOWN_MM, MARKERS, png, printable_name, rounded
+from processor.report.style import BEHIND_TEXT, COLOURS, LEAST_SHOWN_MM, png, printable_name, rounded
 
 MOST_JOINTS = 24  # drawn size: of more the page would be longer than anybody reads; tables have all
 ARROW_SHARE = 0.3  # of the section: how long the longest arrow is drawn
@@ -27,16 +27,6 @@ ALIGNED = {-1: ("right", "top"), 0: ("center", "center"), 1: ("left", "bottom")}
 
 
 WITHIN = "0.45"  # colour of the dot that stands for a gap within its interval
-
-
-def is_beyond(vectors: Floats, half: Floats) -> Bools:
-    """Mark which of vectors (n, 2) lie beyond the 95 % region that half-widths (n, 2) along the axes stand for.
-
-    All of them where the half-widths are not known.
-    """
-    if not np.isfinite(half).all() or not (half > 0.0).all():
-        return np.ones(len(vectors), bool)
-    return np.asarray(NORMAL_95 * np.linalg.norm(vectors / half, axis=1) > RAYLEIGH_95, bool)
 
 
 def gap_vectors(result: Result) -> tuple[Message, bytes]:
@@ -73,35 +63,6 @@ def gap_vectors(result: Result) -> tuple[Message, bytes]:
     if len(shown) < len(measures):
         caption.append(text("the first {shown} of {count} joints", shown=len(shown), count=len(measures)))
     return text("{parts:;}", parts=caption), png(figure)
-
-
-def by_axis(runs: Sequence[StepRun]) -> tuple[Message, bytes]:
-    """Draw the gaps of all methods along each axis, point pair by point pair (paper 000, figures 19 to 21)."""
-    joints = runs[0].result.joints.name[:MOST_JOINTS]
-    figure = Figure(figsize=(max(8.0, 1.8 * len(joints)), 8.2), layout="constrained")
-    panels = figure.subplots(3, 1, sharex=True)
-    place = np.arange(len(joints))[:, None] + np.linspace(-0.38, 0.38, 8)
-    for axis, (axes, name) in enumerate(zip(panels, ("dx, along the span", "dy, across", "dz, up"), strict=True)):
-        for k, run in enumerate(runs):
-            width = run.result.joints.gap_ci95[: len(joints), :, axis]
-            axes.errorbar(
-                (place + 0.022 * (k - 0.5 * (len(runs) - 1))).ravel(),
-                run.result.joints.gaps[: len(joints), :, axis].ravel(),
-                yerr=width.ravel() if np.isfinite(width).any() else None,
-                fmt=MARKERS[k % len(MARKERS)],
-                color=COLOURS[k % len(COLOURS)],
-                markersize=4,
-                markerfacecolor="none",
-                label=run.method,
-            )
-        axes.axhline(0.0, color="0.3", linewidth=0.8)
-        for line in range(1, len(joints)):
-            axes.axvline(line - 0.5, color="0.8", linewidth=0.8)
-        axes.set(ylabel=f"{name}, mm")
-    panels[2].set_xticks(np.arange(len(joints)), [printable_name(joint, j) for j, joint in enumerate(joints)])
-    panels[2].set(xlabel="joint, P1 to P8 from left to right")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=9)
-    return text("Gaps by every method along each axis, right part minus left"), png(figure)
 
 
 def _times(measures: Sequence[Measures]) -> float:

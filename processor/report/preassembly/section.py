@@ -8,10 +8,12 @@ import numpy as np
 
 from processor.language.messages import Message, Text, text
 from processor.limits.judging import JudgedLimits
-from processor.model import Floats, Status, Verdict, worst
-from processor.preassembly.result import Adjustment, MeanMax, Result
+from processor.model import Scene, Status, StepRun, Verdict, worst
+from processor.preassembly.result import MeanMax, Result
 from processor.report import verdict_counts
 from processor.report.preassembly import characteristics, figures, interactive_view, tables
+from processor.report.sheet import picture
+from processor.report.sheet.picture import Callout
 from processor.report.step_report import StepReport, not_ok
 from processor.report.style import Drawn
 
@@ -58,48 +60,17 @@ def _mean_max(error: MeanMax) -> Text:
     )  # fmt: skip
 
 
-def _further(result: Result) -> list[tuple[Message, Message] | tuple[Message, Message, Verdict]]:
-    """Return what the adjustment states of the whole bridge, beside the verdict."""
-    adjustment = result.adjustment
-    if adjustment is None:
+def _callouts(scene: Scene, run: StepRun) -> list[Callout]:
+    """Say at each joint which of its quantities is worst or nearest to its limit."""
+    result: Result = run.result
+    if scene.arch is None or result.adjustment is None:
         return []
-    rows: list[tuple[Message, Message] | tuple[Message, Message, Verdict]] = []
-    if np.isfinite(adjustment.span_departure):
-        sentences = [
-            text("{span} mm against the design", span=_with_ci95(adjustment.span_departure, adjustment.span_ci95))
-        ]
-        if np.isfinite(adjustment.closure).any():
-            sentences.append(_closure(adjustment.closure[0], adjustment.closure_ci95[0]))
-        rows.append((text("Span"), text("{sentences:.}", sentences=sentences), _verdict_on_span(adjustment)))
-    if adjustment.limiting:
-        rows.append((text("What limits the accuracy"), text("{reasons:.}", reasons=adjustment.limiting)))
-    if adjustment.advice:
-        rows.append((text("Which scan would help"), text("{reasons:.}", reasons=adjustment.advice)))
-    return rows
-
-
-def _verdict_on_span(adjustment: Adjustment) -> Verdict:
-    """Return the worst verdict on the limits of the distance of the outer ends; none without such a limit."""
-    return worst(
-        verdict
-        for one in adjustment.chain
-        for key, verdict in zip(one.limits.key, one.limits.verdict, strict=True)
-        if key.startswith(characteristics.CHORDS)
-    )
-
-
-def _closure(shift: Floats, ci95: Floats) -> Text:
-    along, across, up = (_with_ci95(value, half) for value, half in zip(shift.tolist(), ci95.tolist(), strict=True))
-    return text(
-        "Closure by the joints alone, along / across / up: {along} / {across} / {up} mm",
-        along=along,
-        across=across,
-        up=up,
-    )
-
-
-def _with_ci95(value: float, ci95: float) -> Text:
-    return text("{value} ± {ci95}", value=value, ci95=ci95)
+    limits = [one.limits.rows for one in result.adjustment.joints.conformity]
+    return [
+        picture.of_judged(points.mean(axis=0), judged, name)
+        for name, points, judged in zip(result.joints.name, scene.arch.joint_points, limits, strict=False)
+        if judged
+    ]
 
 
 def _to_do(result: Result) -> Iterator[Message]:
@@ -107,10 +78,15 @@ def _to_do(result: Result) -> Iterator[Message]:
     if result.adjustment is None:
         return
     joints = result.adjustment.joints
+    done = []
     for name, verdict, proposal in zip(joints.name, result.joints.verdict, joints.proposal, strict=True):
-        if verdict is not Verdict.PASS or any(one.code in NOT_DONE for one in proposal.reasons):
-            sentence = text("{reasons:.}", reasons=proposal.reasons)
-            yield text("joint {joint} ({verdict}): {sentence}", joint=name, verdict=verdict, sentence=sentence)
+        if verdict is Verdict.PASS and not any(one.code in NOT_DONE for one in proposal.reasons):
+            done.append(name)
+            continue
+        sentence = text("{reasons:.}", reasons=proposal.reasons)
+        yield text("joint {joint} ({verdict}): {sentence}", joint=name, verdict=verdict, sentence=sentence)
+    if done:
+        yield text("{joints}: nothing to do", joints=done)
     yield from result.adjustment.advice[:1]
 
 
@@ -126,13 +102,10 @@ REPORT = StepReport(
     summary=_summary,
     tables=tables.step_tables,
     figures=lambda execution, runs, _: Drawn(figures.draw(execution.scene, runs)),
-    further_verdicts=_further,
     to_do=_to_do,
     why=lambda result: not_ok(result, result.components),
     limits=_limits,
+    callouts=_callouts,
     characteristics=characteristics.of_run,
-    characteristics_note=characteristics.NOTE,
-    live_figures=figures.SHOWN_LIVE,
-    further_figures=figures.OF_OTHER_METHODS,
     interactive_data=interactive_view.interactive_data,
 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -35,13 +34,6 @@ def step_tables(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
     first, method = runs[0].result, runs[0].method
     tables = [*adjusted(first, method), _summary(runs), _components(first), *_others(runs[1:]), _joints(first, method)]
     tables += _by_point(first, text("Splicing error, method {method}", method=method), first.joints.gaps)
-    if np.isfinite(first.joints.gap_ci95).any():
-        title = text("95 % half-widths, method {method}", method=method)
-        tables += [replace(table, folded=True) for table in _by_point(first, title, first.joints.gap_ci95)]
-    for run in runs[1:]:
-        title = text("Splicing error, method {method}", method=run.method)
-        by_point = _by_point(run.result, title, run.result.joints.gaps)
-        tables += [replace(table, on_terminal=False, folded=True) for table in by_point]
     tables += [_gaps(run, "gaps" if run is runs[0] else f"gaps-{run.method}") for run in runs]
     return [*tables, _linear(first, method)]
 
@@ -103,11 +95,7 @@ def _others(runs: Sequence[StepRun]) -> list[Table]:
         if status != Status.OK or reasons
     )
     header = columns("method", "component", "status", "remark")
-    return (
-        [Table(text("Components by the methods compared"), header, rows, "components-compared", folded=True)]
-        if rows
-        else []
-    )
+    return [Table(text("Components by the methods compared"), header, rows, "components-compared")] if rows else []
 
 
 def _joints(result: Result, method: str) -> Table:

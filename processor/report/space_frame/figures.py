@@ -1,4 +1,4 @@
-"""Figures of balls: plan with movements, errors beside the bound, and each flagged ball."""
+"""Figures of balls: plan with movements, errors of radii, and each flagged ball."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
@@ -15,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message, text
-from processor.model import Floats, Scene, StepRun
+from processor.model import Scene, StepRun
 from processor.report.space_frame import flagged_ball_figures, hanger_report
 from processor.report.space_frame.nominal_positions import designed_places, nominal_places
 from processor.report.style import (
@@ -31,12 +30,11 @@ from processor.report.style import (
     rounded,
     translucent,
 )
-from processor.robust_statistics import finite_median
 from processor.space_frame.result import LOCATED_FLAGS, Flag, Result
 
 MOST_LABELS = 30  # drawn size: more lie over each other; the table names all
 ARROW_SHARE = 0.6  # of the way to the next ball: how long all but the longest arrows are drawn
-PLAN, RADIUS_ERRORS, BALL_ERRORS = "plan.png", "radius-errors.png", "ball-errors.png"
+PLAN, RADIUS_ERRORS = "plan.png", "radius-errors.png"
 
 
 def draw(scene: Scene, runs: Sequence[StepRun], report: ErrorReport, stored: Path | None = None) -> Drawn:
@@ -47,8 +45,6 @@ def draw(scene: Scene, runs: Sequence[StepRun], report: ErrorReport, stored: Pat
         figures[PLAN] = _plan(scene, runs[0])
         if report.true_radii:
             figures[RADIUS_ERRORS] = _radius_errors(runs, report)
-        if first.has_bounds:
-            figures[BALL_ERRORS] = _ball_errors(runs[0], report)
     figures |= hanger_report.draw(first)
     flagged = flagged_ball_figures.draw(scene, first, stored) if first.has_bounds else Drawn({})
     return Drawn(figures | flagged.figures, flagged.documents)
@@ -140,7 +136,10 @@ def _radius_errors(runs: Sequence[StepRun], report: ErrorReport) -> tuple[Messag
     low, high = np.quantile(everything, (0.01, 0.99)) if len(everything) else (-1.0, 1.0)
     low, high = min(float(low), -LEAST_SHOWN_MM), max(float(high), LEAST_SHOWN_MM)
     for k, (run, error) in enumerate(zip(runs, errors, strict=True)):
-        _bars(histogram, np.clip(error, low, high), np.linspace(low, high, 31), run.method, k % 4)
+        histogram.hist(
+            np.clip(error, low, high), bins=np.linspace(low, high, 31).tolist(), histtype="stepfilled",
+            facecolor=translucent(COLOURS[k % 4]), edgecolor=COLOURS[k % 4], hatch=HATCHES[k % 4], label=run.method,
+        )  # fmt: skip
         size = np.sort(np.maximum(np.abs(error), LEAST_SHOWN_MM))
         share = np.arange(1, len(size) + 1) / len(run.result.balls)
         cumulative.step(
@@ -157,80 +156,3 @@ def _radius_errors(runs: Sequence[StepRun], report: ErrorReport) -> tuple[Messag
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8)
     return text("Radius errors by method, estimate minus truth; the outermost bars contain all beyond"), png(figure)
-
-
-def _ball_errors(run: StepRun, report: ErrorReport) -> tuple[Message, bytes]:
-    """Draw histograms of radius and centre: errors, or without a truth standard deviations, and those of the bound."""
-    balls = run.result.balls
-    figure = Figure(figsize=(9.0, 3.9), layout="constrained")
-    located = ~balls.flagged(Flag.NOT_FOUND)
-    sd = np.sqrt(np.maximum(np.einsum("kii->ki", balls.covariance), 0.0))[located]
-    bound = balls.bound_sd[located]
-    radii, centres = report.true_radii.get(run.method), report.true_centres.get(run.method)
-    panels = figure.subplots(1, 2)
-    if radii is None or centres is None:
-        _deviations(panels[0], sd[:, 3], bound[:, 3], "sd of the radius, mm", "balls")
-        _deviations(panels[1], sd[:, :3], bound[:, :3], "sd of the centre along x, y and z, mm", "coordinates")
-        caption = text(
-            "Standard deviations as estimated, and the least of any estimate (Cramér-Rao bound); the outermost bars "
-            "contain all beyond"
-        )
-    else:
-        off = (balls.radii - radii)[located], (balls.centres - centres)[located]
-        _errors(panels[0], off[0], sd[:, 3], bound[:, 3], "radius error, mm", "balls")
-        _errors(panels[1], off[1], sd[:, :3], bound[:, :3], "centre error along x, y and z, mm", "coordinates")
-        caption = text(
-            "Errors of radius and centre, estimate minus truth, with their distributions by the estimated standard "
-            "deviations and by the bound; the outermost bars contain all beyond"
-        )
-    for axes in panels:
-        axes.grid(alpha=0.3)
-        axes.set_ylim(0.0, 1.3 * max(axes.get_ylim()[1], 1.0))  # room for the legend
-        axes.legend(fontsize=8, loc="upper left")
-    return caption, png(figure)
-
-
-def _errors(axes: Axes, off: Floats, sd: Floats, bound: Floats, xlabel: str, ylabel: str) -> None:
-    """Draw errors, and the distribution that they would have: a normal one per ball, all added up."""
-    finite = np.isfinite(off)
-    errors = off[finite]
-    reach = float(np.quantile(np.abs(errors), 0.99)) if len(errors) else 1.0
-    reach = 1.15 * max(reach, 2.5 * finite_median(bound[finite]), LEAST_SHOWN_MM)
-    bins = np.linspace(-reach, reach, 31)
-    _bars(axes, np.clip(errors, -reach, reach), bins, f"errors (n = {len(errors)})")
-    x = np.linspace(-reach, reach, 301)
-    for k, (name, one) in enumerate((("Cramér-Rao bound, stations held", bound), ("as stated", sd)), start=1):
-        y = _mixture(x, one[finite], bins[1] - bins[0])
-        if y is not None:
-            axes.plot(x, y, DASHES[k], color=COLOURS[k], label=f"expected, {name}")
-    axes.axvline(0.0, color="0.3", linewidth=0.8)
-    axes.set(xlabel=xlabel, ylabel=ylabel)
-
-
-def _mixture(x: Floats, sd: Floats, width: float) -> Floats | None:
-    """Return how many of the errors with these sd a bar of that width about each x would hold; None without any."""
-    sd = sd[np.isfinite(sd) & (sd > 0.0)]
-    if not len(sd):
-        return None
-    found = np.zeros_like(x)
-    for part in np.array_split(sd, -(-len(sd) // 1000)):  # a roof's balls at once would be too large a table
-        found += (np.exp(-0.5 * (x[:, None] / part) ** 2) / part).sum(axis=1)
-    density: Floats = found * width / np.sqrt(2.0 * np.pi)
-    return density
-
-
-def _deviations(axes: Axes, sd: Floats, bound: Floats, xlabel: str, ylabel: str) -> None:
-    """Draw standard deviations as stated over those of the bound."""
-    ends = [values[np.isfinite(values)] for values in (sd, bound)]
-    high = max([LEAST_SHOWN_MM, *(float(np.quantile(values, 0.98)) for values in ends if len(values))])
-    bins = np.linspace(0.0, 1.1 * high, 31)
-    for k, (name, values) in enumerate(zip(("as stated", "Cramér-Rao bound, stations held"), ends, strict=True)):
-        _bars(axes, np.minimum(values, 1.1 * high), bins, f"{name} (n = {len(values)})", k)
-    axes.set(xlabel=xlabel, ylabel=ylabel)
-
-
-def _bars(axes: Axes, values: npt.NDArray[np.float64], bins: Floats, label: str, k: int = 0) -> None:
-    axes.hist(
-        values, bins=bins.tolist(), histtype="stepfilled", facecolor=translucent(COLOURS[k]),
-        edgecolor=COLOURS[k], hatch=HATCHES[k], label=label,
-    )  # fmt: skip

@@ -8,11 +8,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from processor.language.messages import Message, text
-from processor.model import Status, StepRun
+from processor.model import NORMAL_95, Status, StepRun
 from processor.pipeline import Execution
+from processor.report.characteristics import with_interval
 from processor.report.space_frame import dxf, figures, hanger_report, interactive_view, tables
 from processor.report.step_report import StepReport
 from processor.report.stitching import targets
+from processor.report.table import decimals
 from processor.space_frame.result import Flag, GaugeBasis, Gauges, MovementGauge, Result
 
 MOST_NAMED = 3  # balls of a headline
@@ -33,9 +35,24 @@ def _summary(result: Result) -> tuple[Message, Message | str]:
         named = [text("{node} {flag}", node=result.balls.names[k], flag=result.balls.flag[k]) for k in flagged]
         named[MOST_NAMED:] = [text("...")] if len(named) > MOST_NAMED else []
         head = text("{head} ({named})", head=head, named=named)
+    located = [k for k in range(len(result.balls)) if np.isfinite(result.balls.centres[k]).all()]
+    if len(located) <= MOST_NAMED and len(result.balls) <= MOST_NAMED:
+        head = text("{each:;}", each=[head, *(_place(result, k) for k in located)])
     if result.gauges is not None:
         head = text("{head}; {movements}", head=head, movements=_movements(result, result.gauges))
     return head, text("Flagged: {counts}.", counts=counts) if counts else ""
+
+
+def _place(result: Result, k: int) -> Message:
+    """Say where a ball is, in metres, and how large."""
+    balls = result.balls
+    half = NORMAL_95 * np.sqrt(np.maximum(np.diag(balls.covariance[k]), 0.0))
+    widest = float(half[:3].max())
+    return text(
+        "ball {name} at {x:.4f}, {y:.4f}, {z:.4f} m ± {centre} mm, radius {radius}",
+        name=balls.names[k], **dict(zip("xyz", (balls.centres[k] / 1000.0).tolist(), strict=True)),
+        centre=f"{widest:.{decimals(widest)}f}", radius=with_interval(balls.radii[k], half[3], "mm", ""),
+    )  # fmt: skip
 
 
 def _movements(result: Result, gauges: Gauges) -> Message:
@@ -85,6 +102,8 @@ REPORT = StepReport(
     tables=tables.step_tables,
     figures=lambda execution, runs, report: figures.draw(execution.scene, runs, report, execution.stored),
     files=_files,
+    callouts=tables.callouts,
+    sheet_tables=tables.listed,
     why=_why,
     interactive_data=interactive_view.interactive_data,
 )

@@ -12,10 +12,12 @@ import numpy as np
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message, text
-from processor.model import NORMAL_95, Floats, Status, StepRun, Verdict
+from processor.model import NORMAL_95, Floats, Scene, Status, StepRun, Verdict
+from processor.report.characteristics import with_interval
 from processor.report.columns import MM, XYZ, columns, under
+from processor.report.sheet.picture import Callout
 from processor.report.space_frame import hanger_report
-from processor.report.table import NAN, Table, rows_of, tabulate
+from processor.report.table import NAN, PLUS_MINUS, Table, rows_of, tabulate
 from processor.robust_statistics import finite_median
 from processor.space_frame.result import Balls, Evidence, Flag, Result
 from processor.space_frame.spheres.baselines import SAME
@@ -28,6 +30,7 @@ SIZES = (
 BRIEF = (
     "id", PLACE, "radius_mm", "ci95_radius_mm", "size_mm", "lowest_z_mm", "ci95_lowest_z_mm", "evidence", "flag",
 )  # fmt: skip
+MOST_FLAGGED, MOST_MOVED = 4, 3  # named in the picture of the sheet
 OF_FRAME: dict[str, Any] = {"units": MM, "on_terminal": False}
 OF_FILE: dict[str, Any] = {**OF_FRAME, "on_page": False}
 
@@ -51,7 +54,7 @@ def step_tables(runs: Sequence[StepRun], report: ErrorReport) -> list[Table]:
             cells = {name.replace("ci95_", "formal_ci95_"): cells[name] for name in names}
             note = "" if run is runs[0] else text("{reasons}", reasons=run.result.reasons)
             table = tabulate(_title(run.method), cells, file, note, units=MM, on_terminal=run is runs[0])
-        tables.append(replace(table, folded=run is not runs[0]))
+        tables.append(table)
     tables += hanger_report.tables(first)
     if whole:
         tables += [_brief(first, runs[0].method), _lowest(first.balls), *_nodes(first), *_tubes(first)]
@@ -141,11 +144,76 @@ def _lowest(balls: Balls) -> Table:
         "radius_mm": balls.radii,
         "flag": balls.flag,
     }
-    note = text(
-        "Lowest point of each ball's sphere, in the input's own frame; a process hole cuts it away. ci95 is the "
-        "half-width of the 95 % interval."
-    )
-    return tabulate(text("Lowest points"), cells, "lowest", note, **OF_FILE)
+    return tabulate(text("Lowest points"), cells, "lowest", **OF_FILE)
+
+
+MOST_LISTED = 80  # balls on the sheet: two pages
+LISTED = (
+    "id", "x_m", "y_m", "z_m", "ci95_mm", "radius_mm", "ci95_radius_mm", "lowest_z_m", "ci95_lowest_z_mm",
+)  # fmt: skip
+LISTED_NOTE = text(
+    "Centres and lowest points in the frame of the input, metres; ± is the half-width of the 95 % interval, of a "
+    "centre the widest of the three. {movements}"
+)
+
+
+def listed(_: Scene, run: StepRun) -> list[Table]:
+    """List the balls for the sheet: coordinates, lowest points, movements; of very many the flagged and most moved."""
+    result: Result = run.result
+    half, size = NORMAL_95 * _sd(result.balls), result.balls.movement_size
+    flagged = ~result.balls.flagged(Flag.OK)
+    moved = np.nan_to_num(size) if len(size) else np.zeros(len(result.balls))
+    rows = np.sort(np.lexsort((-moved, ~flagged))[:MOST_LISTED])
+    balls, half = result.balls.take(rows), half[rows]
+    cells: dict[str, Any] = {
+        "id": balls.names,
+        "x_m y_m z_m": balls.centres / 1000.0,
+        "ci95_mm": half[:, :3].max(axis=1),
+        "radius_mm": balls.radii,
+        "ci95_radius_mm": half[:, 3],
+        "lowest_z_m": balls.lowest[:, 2] / 1000.0,
+        "ci95_lowest_z_mm": NORMAL_95 * balls.lowest_sd,
+    }
+    if result.movement_reference is not None:
+        cells |= {SHIFT: balls.movement, "movement_mm": balls.movement_size,
+                  "ci95_movement_mm": balls.movement_size_ci95}  # fmt: skip
+        if set(balls.verdict) - {Verdict.NONE}:
+            cells["verdict"] = balls.verdict
+    if flagged.any():
+        cells["flag"] = ["" if flag is Flag.OK else flag for flag in balls.flag]
+    movements = "" if result.movement_reference is None else _nodes_note(result)
+    note = text(LISTED_NOTE.template, movements=movements)
+    if len(rows) < len(flagged):
+        note = text("{note} {count} of {all} balls; the others are in balls.csv.", note=note, count=len(rows),
+                    all=len(flagged))  # fmt: skip
+    table = tabulate(text("Balls: coordinates, lowest points, movements"), cells, note=note)
+    short = {"ci95_mm": PLUS_MINUS, "ci95_lowest_z_mm": PLUS_MINUS}
+    return [
+        replace(table, columns=tuple(replace(one, heading=short.get(one.name, one.heading)) for one in table.columns))
+    ]
+
+
+def callouts(scene: Scene, run: StepRun) -> list[Callout]:
+    """Say at balls of the design what is flagged, and how far those moved most did."""
+    result: Result = run.result
+    if scene.frame is None:
+        return []
+    place_of, balls = dict(zip(scene.frame.ids.tolist(), scene.frame.centres, strict=True)), result.balls
+    moved = rows_of(balls.movement_size, balls.movement_size_ci95)
+    order = np.argsort(-np.nan_to_num(balls.movement_size), kind="stable").tolist() if len(balls.movement_size) else []
+    found, half = [], NORMAL_95 * _sd(balls)[:, 3]
+    for k in dict.fromkeys([*np.flatnonzero(~balls.flagged(Flag.OK)).tolist()[:MOST_FLAGGED], *order[:MOST_MOVED]]):
+        flag, place = balls.flag[k], place_of.get(int(balls.ids[k]))
+        if place is None:
+            continue
+        verdict, said = Verdict.NONE if flag is Flag.OK else Verdict.INDETERMINATE, [balls.names[k]]
+        if flag is not Flag.OK:
+            said += [flag, text("radius {size}", size=with_interval(balls.radii[k], half[k], "mm", ""))]
+        if len(order) and np.isfinite(balls.movement_size[k]):
+            said.append(text("moved {by}", by=with_interval(moved[k][0], moved[k][1], "mm", "")))
+            verdict = balls.verdict[k] if balls.verdict[k] is Verdict.FAIL else verdict
+        found.append(Callout(place, text("{said}", said=said), verdict))
+    return found
 
 
 # --- the frame -----------------------------------------------------------------------------------------------------
@@ -287,8 +355,7 @@ def _tubes(result: Result) -> list[Table]:
         "ci95_axis_mm": np.where(end > start, end, start),
         "bow_mm": tubes.bow,
     }
-    note = text("Axes between the ends of the scanned stretch; bow is the largest deviation from a straight line.")
-    return [tabulate(text("Tubes"), cells, "tubes", note, **OF_FILE)]
+    return [tabulate(text("Tubes"), cells, "tubes", **OF_FILE)]
 
 
 def _stations(result: Result) -> list[Table]:

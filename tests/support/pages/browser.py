@@ -38,7 +38,7 @@ SHARED = _Shared()  # closed by a fixture of tests/conftest.py when the tests of
 
 @contextmanager
 def opened(path, width=1200, height=900):
-    """Yield the page of a file; on leaving, nothing was said on its console and nothing but the file was asked for.
+    """Yield the page of a file, unfolded; on leaving, nothing was said on its console and only the file was asked for.
 
     Skips where there is no Chromium, but not in continuous integration.
     """
@@ -58,6 +58,7 @@ def opened(path, width=1200, height=900):
         page.on(event, listener)
     try:
         page.goto(path.as_uri())
+        page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
         yield page
     finally:
         for event, listener in listeners.items():

@@ -95,7 +95,7 @@ def assembled(method="design-aided", names=("foot1", "rib1", "foot2"), joints=("
     )
 
 
-OWN = {"linear-offset.png", "gap-vectors.png", "trade-off.png", "residuals.png"}
+OWN = {"linear-offset.png", "gap-vectors.png"}
 
 ACROSS = [[450, -550], [-450, -550], [-450, 550], [450, 550], [0, -550], [-450, 0], [0, 550], [450, 0]]
 
