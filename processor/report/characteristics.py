@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
-from processor.language.messages import Message, label, text
+from processor.language.messages import Message, Text, label, text
 from processor.limits.judging import Judged, JudgedLimits
 from processor.model import WORST_FIRST, StepRun, Verdict
 from processor.report.columns import columns
@@ -22,9 +22,9 @@ MOST_NAMED = 4  # of a summary of one or two lines
 
 
 def worst_first(rows: Iterable[Judged]) -> list[Judged]:
-    """Return what was judged with the worst first, else in its order."""
+    """Return what was judged with the worst first, what was not measured last, else in its order."""
     order = {verdict: place for place, verdict in enumerate(WORST_FIRST)}
-    return sorted(rows, key=lambda one: order.get(one.verdict, len(order)))
+    return sorted(rows, key=lambda one: (order.get(one.verdict, len(order)), not math.isfinite(one.value)))
 
 
 def limits_of(run: StepRun) -> JudgedLimits | None:
@@ -81,8 +81,15 @@ def summary(judged: Iterable[Judged]) -> Message:
     )
 
 
+def name_of(one: Judged) -> Message | str:
+    """Return what was measured: some steps name a characteristic, others the thing of which ``what`` is one."""
+    is_thing = isinstance(one.of, Text) and one.of.values is None and str(one.what) not in ("", str(one.of))
+    name: Message | str = text("{of} {what}", of=one.of, what=one.what) if is_thing else one.of
+    return name
+
+
 def _named(one: Judged) -> Message:
-    return text("{id} {deviation}", id=one.of, deviation=with_interval(one.value, one.ci95, one.unit))
+    return text("{id} {deviation}", id=name_of(one), deviation=with_interval(one.value, one.ci95, one.unit))
 
 
 def with_interval(value: float, half: float, unit: str, sign: str = "+") -> str:
@@ -106,7 +113,7 @@ def allowed(low: float, high: float) -> str:
     if math.isnan(low) or math.isnan(high) or (math.isinf(low) and math.isinf(high)):
         return ""
     if math.isinf(low):
-        return f"≤ {high:g}"
+        return f"≤ {high:.3g}"
     if math.isinf(high):
-        return f"≥ {low:g}"
-    return f"± {high:g}" if low == -high else f"{low:g} / {high:g}"
+        return f"≥ {low:.3g}"
+    return f"± {high:.3g}" if low == -high else f"{low:.3g} / {high:.3g}"

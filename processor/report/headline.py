@@ -32,15 +32,16 @@ def of_run(execution: Execution, lang: str = "en") -> str:
     return "; ".join(messages(lang).text(sentence) for sentence in answer(execution))
 
 
-def answer(execution: Execution) -> list[Message]:
-    """Return what was found, in sentences: the verdict with what fails by how much, then each step's headline."""
+def answer(execution: Execution, word: bool = True) -> list[Message]:
+    """Return what was found, in sentences: what fails by how much, after the verdict if ``word``, then each step's."""
     runs = [run for run, _ in execution.by_step()]
     held = [one for run in runs for one in characteristics_of(execution.scene, run)]
     headlines: list[Message] = [of_step(run) for run in runs]
     verdict = worst(run.verdict for run in runs)
     if not held or verdict is Verdict.NONE:
         return headlines
-    return [text("{verdict}: {summary}", verdict=BANNER[verdict], summary=characteristics.summary(held)), *headlines]
+    summary = characteristics.summary(held)
+    return [text("{verdict}: {summary}", verdict=BANNER[verdict], summary=summary) if word else summary, *headlines]
 
 
 def of_step(run: StepRun) -> Text:

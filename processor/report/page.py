@@ -139,7 +139,7 @@ def _cell(cell: Any, written: str, column: Column, lang: str) -> tuple[str, str]
     if isinstance(cell, int | float | np.number):
         return "number", written
     if isinstance(cell, Verdict):
-        return f"verdict {TONES[cell]}", messages(lang).text(cell)
+        return f"verdict {TONES[cell]}", "" if cell is Verdict.NONE else messages(lang).text(cell)
     if not isinstance(cell, str) or isinstance(cell, Word):
         translated = shown(messages(lang).text(cell))
     else:

@@ -35,7 +35,7 @@ PAGE = (210.0, 297.0)  # mm, A4
 LEFT, TOP, WIDTH, FOOT = 14.0, 15.0, 182.0, 280.0  # mm, from the upper left corner; FOOT ends what is written
 POINT = 25.4 / 72.0  # mm
 BODY, CELL, SMALL, HEADING = 8.4, 7.4, 6.8, 10.0  # points
-GAP = 2.2  # mm between columns
+GAP, WIDEST_GAP = 2.2, 7.0  # mm between columns
 LEAST_CELL = 4.6  # points: what a table that is too wide is written in at least
 WIDER = 1.08  # times the width of common letters: those of verdicts are bold
 SOFT, RULE = "#5a6675", "#c9d1d8"
@@ -162,7 +162,9 @@ COLOURS = {"good": TONES[Verdict.PASS], "bad": TONES[Verdict.FAIL], "open": TONE
 
 
 def _starts(widths: Sequence[float]) -> list[float]:
-    return [LEFT + sum(widths[:k]) + GAP * k for k in range(len(widths))]
+    """Return where columns begin; room that is left stands between them, as far as a row is still read across."""
+    gap = min((WIDTH - sum(widths)) / max(len(widths) - 1, 1), WIDEST_GAP)
+    return [LEFT + sum(widths[:k]) + gap * k for k in range(len(widths))]
 
 
 def _fitted(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> tuple[float, list[float]]:

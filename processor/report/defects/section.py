@@ -41,5 +41,7 @@ REPORT = StepReport(
     tables=tables.step_tables,
     figures=lambda _, runs, __: Drawn(figures.draw(runs[0].result)),
     files=lambda _, run: figures.files(run.result),
+    callouts=tables.callouts,
+    sheet_tables=tables.listed,
     interactive_data=interactive_view.interactive_data,
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,13 @@ import numpy as np
 from processor.defects.result import DefectClass, Result
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import text
-from processor.model import StepRun
+from processor.model import Scene, StepRun
+from processor.report.characteristics import with_interval
 from processor.report.columns import MM, columns
+from processor.report.sheet.picture import Callout
 from processor.report.table import Table, tabulate, yes_no
 
+MOST_LISTED = 100  # defects on the sheet: two pages
 LIST_NOTE = text(
     "Centres in the design's frame; a depth inward is positive. ci95 is the half-width of the 95 % interval. The depth "
     "of a missing part is the design's thickness. Confidence 0.5: both classes are equally likely; "
@@ -86,6 +90,40 @@ def _list(run: StepRun, is_first: bool) -> Table:
     file = "defects" if is_first else f"defects-{run.method}"
     note = LIST_NOTE if is_first else text("{reasons}", reasons=run.result.reasons)
     return tabulate(title, cells, file, note, units=MM, on_terminal=is_first)
+
+
+def listed(_: Scene, run: StepRun) -> list[Table]:
+    """List the defects for the sheet, in metres."""
+    defects = run.result.defects
+    cells = {
+        "id": defects.id,
+        "class": defects.defect_class,
+        "component": defects.component,
+        "depth_max_mm": defects.depth_max,
+        "depth_ci95_mm": defects.depth_ci95,
+        "area_mm2": defects.area_mm2,
+        "x_m y_m z_m": defects.centre / 1000.0,
+        "doubtful": [text("yes") if doubtful else "" for doubtful in defects.doubtful],
+    }
+    table = tabulate(text("Defects, method {method}", method=run.method), cells)
+    return [replace(table, rows=table.rows[:MOST_LISTED])]
+
+
+def callouts(_: Scene, run: StepRun) -> list[Callout]:
+    """Say what the largest defects that are not doubtful are, and how deep."""
+    defects = run.result.defects
+    order = np.argsort(-defects.area_mm2, kind="stable").tolist()
+    return [
+        Callout(
+            defects.centre[k],
+            text(
+                "{id}: {kind} {depth}", id=defects.id[k], kind=defects.defect_class[k],
+                depth=with_interval(defects.depth_max[k], defects.depth_ci95[k], "mm"),
+            ),
+        )
+        for k in order
+        if not defects.doubtful[k]
+    ]  # fmt: skip
 
 
 def _least_depth(result: Result) -> Table:

@@ -13,9 +13,11 @@ from processor.geometry.m3c2 import Z95
 from processor.language.messages import Message, text
 from processor.model import Ints, Scene, Status, StepRun
 from processor.pipeline import Execution
+from processor.report.characteristics import with_interval
 from processor.report.charts import surface_view
 from processor.report.charts.stepped_colours import Band
 from processor.report.deviation import core_points_csv, face_maps, figures
+from processor.report.sheet.picture import Callout
 from processor.report.step_report import StepReport
 from processor.report.style import CaptionedPngs, Drawn
 from processor.report.table import figures_of
@@ -109,11 +111,28 @@ def _live(_: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
     )
 
 
+def _callouts(_: Scene, run: StepRun) -> list[Callout]:
+    """Say what the least and the greatest deviation are, with their level of detection."""
+    core, known = run.result.core, np.isfinite(run.result.core.lod95)
+    rows = (
+        np.flatnonzero(known)[[np.argmin(core.distance[known]), np.argmax(core.distance[known])]] if known.any() else ()
+    )
+    return [
+        Callout(
+            core.points[k] + run.result.origin,
+            text("{value}", value=with_interval(float(core.distance[k]), float(core.lod95[k]), "mm")),
+        )
+        for k in rows
+    ]
+
+
 REPORT = StepReport(
     title=text("Deviation"),
     summary=_summary,
     tables=lambda runs, _: [figures_of("Deviation of the surface from the design", runs, "deviation-figures")],
     figures=lambda *given: Drawn(_figures(*given)),
     files=_files,
+    callouts=_callouts,
+    sheet_tables=lambda _, run: [figures_of("Deviation of the surface from the design", [run], "")],
     interactive_data=_live,
 )

@@ -83,15 +83,15 @@ def _callouts(scene: Scene, run: StepRun) -> list[Callout]:
 
 
 def _beyond(result: Result) -> Iterator[Message]:
-    """Yield the characteristics that fail their limits."""
+    """Yield for each component the characteristics that fail their limits."""
     for component in result.components:
-        for row in component.characteristics.items():
-            if row["verdict"] is Verdict.FAIL:
-                yield text(
-                    "correct {component}: {quantity} is off by {deviation} ± {ci95} mm",
-                    component=component.name, quantity=label(row["quantity"]), deviation=row["deviation"],
-                    ci95=row["ci95"],
-                )  # fmt: skip
+        failing = [
+            text("{what} {size}", what=row["id"], size=with_interval(row["deviation"], row["ci95"], row["unit"]))
+            for row in component.characteristics.items()
+            if row["verdict"] is Verdict.FAIL
+        ]
+        if failing:
+            yield text("correct {component}: {failing}", component=component.name, failing=failing)
 
 
 def _characteristics(_: Scene, run: StepRun) -> list[Judged]:

@@ -49,11 +49,11 @@ def of_judged(place: Floats, judged: Sequence[Judged], name: Message | str, part
 
     It is of the ``name``, or if that is empty of what was judged.
     """
-    order = {verdict: place for place, verdict in enumerate(WORST_FIRST)}
-    one = min(judged, key=lambda one: (order.get(one.verdict, len(order)), -characteristics.nearness(one)))
-    said = text(
-        "{name} {value}", name=name or one.of, value=characteristics.with_interval(one.value, one.ci95, one.unit)
-    )
+    one = characteristics.worst_first(sorted(judged, key=characteristics.nearness, reverse=True))[0]
+    value: Message | str = text("not measured")
+    if np.isfinite(one.value):
+        value = characteristics.with_interval(one.value, one.ci95, one.unit)
+    said = text("{name} {value}", name=name or characteristics.name_of(one), value=value)
     if one.verdict is not Verdict.NONE:
         limits = characteristics.allowed(one.low, one.high)
         said = text("{said}, limit {limits}: {verdict}", said=said, limits=limits, verdict=one.verdict)
@@ -61,15 +61,17 @@ def of_judged(place: Floats, judged: Sequence[Judged], name: Message | str, part
 
 
 def draw(scene: Scene, callouts: Sequence[Callout]) -> bytes:
-    """Draw the design with the worst callouts as PNG; nothing without a design that has a surface or nodes."""
+    """Draw the design, without one the places of all callouts, with the worst callouts as PNG; b"" of nothing."""
     order = {verdict: place for place, verdict in enumerate(WORST_FIRST)}
     known = [one for one in callouts if np.isfinite(one.place).all()]
     chosen = sorted(known, key=lambda one: order.get(one.verdict, len(order)))[:MOST_CALLOUTS]
     parts = list(_surfaces(scene))
     lines = [] if scene.arch is None else list(_bare(scene.arch))
     places = [*(vertices for _, vertices, _ in parts), *lines, *([] if scene.frame is None else [scene.frame.centres])]
-    everything = np.concatenate([np.empty((0, 3)), *places])
-    if not len(everything):
+    if not places:  # without a design the places alone
+        places = [np.reshape([one.place for one in known], (-1, 3))]
+    everything = np.concatenate(places)
+    if len(everything) < 2:
         return b""
     view = _view(everything)
     seen = everything @ view[:2].T
@@ -87,6 +89,8 @@ def draw(scene: Scene, callouts: Sequence[Callout]) -> bytes:
     axes.add_collection(LineCollection([line @ view[:2].T for line in lines], colors="#8a96a2", linewidths=2.0))
     if scene.frame is not None:
         _draw_frame(axes, scene, view)
+    elif not parts and not lines:
+        axes.plot(*(everything @ view[:2].T).T, "o", markersize=5.0, color="#66727e", zorder=2)
     if scene.arch is not None:
         _draw_joints(axes, scene.arch, view)
     scale = max(across / (0.94 * WIDE), up / tall)  # mm of the structure by inch
@@ -113,6 +117,11 @@ class Label:
     x: float
 
 
+def width_of(said: str) -> float:
+    """Return the width of a callout in inches, with a margin."""
+    return float(TextPath((0, 0), said, size=SIZE, prop=BOLD).get_extents().width) / 72.0 + 0.25
+
+
 def _placed(callouts: Sequence[Callout], seen: Sequence[Floats], ends: tuple[Floats, Floats]) -> list[Label]:
     """Give each callout a lane above or below the structure, none over another."""
     middle = 0.5 * (ends[0] + ends[1])
@@ -121,7 +130,7 @@ def _placed(callouts: Sequence[Callout], seen: Sequence[Floats], ends: tuple[Flo
     labels = []
     for k in sorted(range(len(callouts)), key=lambda k: float(seen[k][0])):
         said = drawable(messages("en").text(callouts[k].said))
-        width = TextPath((0, 0), said, size=SIZE, prop=BOLD).get_extents().width / 72.0 + 0.25
+        width = width_of(said)
         x, reach = float(seen[k][0] - middle[0]) / scale, max(0.0, 0.5 * (WIDE - width))
         x, side = float(np.clip(x, -reach, reach)), bool(seen[k][1] >= middle[1])
         slots = [(above, lane) for lane in range(1, LANES + 1) for above in (side, not side)]
@@ -192,7 +201,10 @@ def _draw_joints(axes: Axes, arch: ArchDesign, view: Floats) -> None:
     for part in arch.parts if len(arch.parts) <= MOST_NAMED else ():
         if len(part.vertices):
             x, y = view[:2] @ part.vertices.mean(axis=0)
-            axes.text(x, y, drawable(part.name), fontsize=SIZE, color="#2b3640", ha="center", va="center", zorder=3)
+            axes.annotate(
+                drawable(part.name), (x, y), (0, -0.8 * SIZE), textcoords="offset points", fontsize=SIZE,
+                color="#2b3640", ha="center", va="center", zorder=3,
+            )  # fmt: skip
 
 
 def _write(axes: Axes, label: Label, scale: float, edge: tuple[float, float]) -> None:

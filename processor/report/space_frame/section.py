@@ -18,6 +18,7 @@ from processor.report.table import decimals
 from processor.space_frame.result import Flag, GaugeBasis, Gauges, MovementGauge, Result
 
 MOST_NAMED = 3  # balls of a headline
+MOST_TO_DO = 6  # balls named one by one
 
 
 def _summary(result: Result) -> tuple[Message, Message | str]:
@@ -96,12 +97,25 @@ def _why(result: Result) -> Iterator[Message]:
             )  # fmt: skip
 
 
+def _to_do(result: Result) -> Iterator[Message]:
+    """Yield the balls to look at, and why."""
+    flagged = [k for k, flag in enumerate(result.balls.flag) if flag is not Flag.OK]
+    for k in flagged[:MOST_TO_DO]:
+        reasons = text("{reasons:;}", reasons=result.balls.reasons[k])
+        yield text("ball {name} ({flag}): {reasons}", name=result.balls.names[k], flag=result.balls.flag[k],
+                   reasons=reasons)  # fmt: skip
+    if len(flagged) > MOST_TO_DO:
+        yield text("and {count} more", count=len(flagged) - MOST_TO_DO)
+
+
 REPORT = StepReport(
     title=text("Bolt balls"),
     summary=_summary,
     tables=tables.step_tables,
     figures=lambda execution, runs, report: figures.draw(execution.scene, runs, report, execution.stored),
     files=_files,
+    to_do=_to_do,
+    characteristics=tables.characteristics,
     callouts=tables.callouts,
     sheet_tables=tables.listed,
     why=_why,

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.language.messages import Message, text
+from processor.language.messages import Message, label, text
+from processor.limits.judging import Judged
 from processor.model import NORMAL_95, Floats, Scene, Status, StepRun, Verdict
 from processor.report.characteristics import with_interval
 from processor.report.columns import MM, XYZ, columns, under
@@ -193,12 +194,34 @@ def listed(_: Scene, run: StepRun) -> list[Table]:
     ]
 
 
-def callouts(scene: Scene, run: StepRun) -> list[Callout]:
-    """Say at balls of the design what is flagged, and how far those moved most did."""
+def characteristics(_: Scene, run: StepRun) -> list[Judged]:
+    """Return the movements of nodes that are compared with the limit of their place."""
     result: Result = run.result
-    if scene.frame is None:
+    balls, reference = result.balls, result.movement_reference
+    if reference is None:
         return []
-    place_of, balls = dict(zip(scene.frame.ids.tolist(), scene.frame.centres, strict=True)), result.balls
+    risks = (balls.risk_accept, balls.risk_reject) if len(balls.risk_accept) else 2 * (np.full(len(balls), NAN),)
+    return [
+        Judged(
+            of=text("node {id}", id=name), value=value, ci95=half, high=reference.limit, low=-math.inf, verdict=verdict,
+            risk_accept=accept, risk_reject=reject, clause=label(reference.limit_source),
+        )
+        for name, value, half, verdict, accept, reject in zip(
+            balls.names, balls.movement_size, balls.movement_size_ci95, balls.verdict, *risks, strict=False
+        )
+        if verdict is not Verdict.NONE and math.isfinite(value)
+    ]  # fmt: skip
+
+
+def callouts(scene: Scene, run: StepRun) -> list[Callout]:
+    """Say at balls of the design what is flagged, and how far those moved most did; without a design name the balls."""
+    result: Result = run.result
+    balls = result.balls
+    if scene.frame is None:
+        return [
+            Callout(place, text("{name}", name=name)) for name, place in zip(balls.names, balls.centres, strict=True)
+        ]
+    place_of = dict(zip(scene.frame.ids.tolist(), scene.frame.centres, strict=True))
     moved = rows_of(balls.movement_size, balls.movement_size_ci95)
     order = np.argsort(-np.nan_to_num(balls.movement_size), kind="stable").tolist() if len(balls.movement_size) else []
     found, half = [], NORMAL_95 * _sd(balls)[:, 3]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 from processor.language.messages import Message, text
 from processor.model import Status, StepRun
@@ -40,6 +41,7 @@ REPORT = StepReport(
     tables=tables.step_tables,
     figures=lambda *given: Drawn(figures.draw(*given)),
     files=_files,
+    sheet_tables=lambda _, run: [replace(tables.scanner_places(run.result, run.method), note="")],
     why=lambda result: not_ok(result, result.scans),
     interactive_data=interactive_view.interactive_data,
 )

@@ -37,7 +37,7 @@ def step_tables(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
     for number, run in enumerate(runs):
         result, suffix = run.result, f"-{run.method}" if number else ""
         tables += [
-            _scans(result, run.method, suffix),
+            scanner_places(result, run.method, suffix),
             _pairs(result, run.method, suffix),
             _loops(result, run.method, suffix),
             _matrices(result, run.method),
@@ -50,7 +50,8 @@ def step_tables(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
     return tables
 
 
-def _scans(result: Result, method: str, suffix: str) -> Table:
+def scanner_places(result: Result, method: str, suffix: str = "") -> Table:
+    """Tabulate where the scanner stood for each scan."""
     scans = result.scans
     cells = {
         "scan": scans.name,
