@@ -83,7 +83,8 @@ def _table(title: Message, judged: Sequence[Judged], clauses: Sequence[Message])
     rows = tuple(
         (
             characteristics.name_of(one), one.value, one.ci95, characteristics.allowed(one.low, one.high), one.verdict,
-            one.nominal, one.actual, one.unit, _risk(one), str(clauses.index(one.clause) + 1) if one.clause in clauses else "",
+            one.nominal, one.actual, one.unit, _risk(one),
+            str(clauses.index(one.clause) + 1) if one.clause in clauses else "",
         )
         for one in judged
     )  # fmt: skip
