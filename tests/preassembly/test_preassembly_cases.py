@@ -245,6 +245,21 @@ def test_scan_of_a_shorter_part_in_a_longer_one_s_place_is_named_by_its_ends(mon
     assert (own.rejected, own.doubts, own.parts) == ((), (), ("rib2",))
 
 
+def test_scan_of_a_shorter_part_in_its_own_place_is_no_longer_part_s(monkeypatch):
+    """Its points lie on the longer part as well, to what a rough pose shows; only of its own it shows both ends."""
+    scene, truth = arch_clouds.bridge(spacing_mm=30.0, sigma_mm=1.0, seed=1)
+    points = rigid.apply(truth.arch.T_bridge_scan[2], scene.scans[2].points)
+    poses = {"rib1": along_the_arch(2, 1), "rib2": np.eye(4)}
+    find = lambda _, part, *__: attitude.Attitude(poses[part.name], poses[part.name], Status.OK)  # noqa: E731
+    monkeypatch.setattr(attitude, "find", find)
+    monkeypatch.setattr(assignment, "rather", lambda _, index, *__: 1 if index == 2 else None)
+    own = measure._place(Scan("scan", points, component="rib2"), 2, shapes_of(scene.arch), 1.0)
+    assert (own.rejected, own.doubts, own.parts) == ((), (), ("rib2",))
+    half = points[points[:, 0] > np.median(points[:, 0])]  # of which no end is shown on the other side
+    found = measure._place(Scan("scan", half, component="rib2"), 2, shapes_of(scene.arch), 1.0)
+    assert codes(found.rejected)[0] == "preassemble.scan-of-others"
+
+
 def test_scan_that_covers_half_of_another_part_is_rejected(monkeypatch):
     """A rib turned about the arch's middle until it ends where the foot does: its upper half lies on the foot.
 

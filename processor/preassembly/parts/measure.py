@@ -436,19 +436,21 @@ def _identified(scan: Scan, points: Floats, station: Ints, index: int, shapes: a
     """Register the points (n, 3) of a scan, and check that they are of part ``index``."""
     part, every = shapes.design.parts[index], tuple(part.name for part in shapes.design.parts)
     other = assignment.rather(points, index, shapes)
+    placed: _PlacedScan | None = None
     if other is not None:
         # Only a scan that fits the other part is of the other part; a misfit may have other causes.
         there = _register(scan, points, station, other, shapes) if other >= 0 else None
         if there is None or not (there.rejected or there.doubts):
             parts = () if there is None else there.identity.parts(shapes.design.parts[other].name)
             if part.name not in parts:
-                if not assignment.of_size(points, shapes):  # with splice plates it is longer than any part
-                    own = _register(scan, points, station, index, shapes)
-                    if any(one.code == "preassemble.splice-plates" for one in own.rejected):
-                        return replace(own, parts=every)
-                why = (*ScanParts(scan.name, part.name, parts).wrong, *_resemblance(points, index, shapes))
-                return _PlacedScan(scan, points, station, attitude.NOWHERE, rejected=why, parts=parts)
-    placed = _register(scan, points, station, index, shapes)
+                if there is not None or not assignment.of_size(points, shapes):
+                    placed = _register(scan, points, station, index, shapes)
+                    if any(one.code == "preassemble.splice-plates" for one in placed.rejected):  # longer than any part
+                        return replace(placed, parts=every)
+                if there is None or not _fits_with_ends(placed, index, there, other, shapes):
+                    why = (*ScanParts(scan.name, part.name, parts).wrong, *_resemblance(points, index, shapes))
+                    return _PlacedScan(scan, points, station, attitude.NOWHERE, rejected=why, parts=parts)
+    placed = placed or _register(scan, points, station, index, shapes)
     if placed.identity.contradiction and not placed.rejected:
         # A part of another size may by chance have its mark where the other part of this shape has its own.
         resemblance = _resemblance(points, index, shapes)
@@ -482,6 +484,19 @@ def _by_ends(placed: _PlacedScan, index: int, shapes: attitude.Shapes) -> _Place
             found += there.identity.parts(shapes.design.parts[k].name)
     why = reason("preassemble.ends-of-other", parts=tuple(found), length=missing)
     return replace(placed, doubts=(*placed.doubts, why), parts=tuple(found)) if found else None
+
+
+def _fits_with_ends(
+    placed: _PlacedScan | None, index: int, there: _PlacedScan, other: int, shapes: attitude.Shapes
+) -> bool:
+    """Whether a scan fits part ``index`` with all ends, while part ``other`` goes on where the scan's points end."""
+    if placed is None or placed.rejected or placed.doubts:
+        return False
+    of_part, of_other = (
+        max(_not_shown(one.points, one.registration.T_design_scan, k, shapes), default=0.0)
+        for one, k in ((placed, index), (there, other))
+    )
+    return of_part <= SHORT_MM < of_other
 
 
 def _not_shown(points: Floats, T: Floats, index: int, shapes: attitude.Shapes) -> list[float]:
