@@ -202,7 +202,7 @@ def _draw_joints(axes: Axes, arch: ArchDesign, view: Floats) -> None:
         if len(part.vertices):
             x, y = view[:2] @ part.vertices.mean(axis=0)
             axes.annotate(
-                drawable(part.name), (x, y), (0, -0.8 * SIZE), textcoords="offset points", fontsize=SIZE,
+                drawable(part.name), (x, y), (0, -1.8 * SIZE), textcoords="offset points", fontsize=SIZE,
                 color="#2b3640", ha="center", va="center", zorder=3,
             )  # fmt: skip
 
