@@ -168,6 +168,17 @@ def test_far_patches_between_rays_are_no_contradiction():
     assert share[2] < 0.1  # 240 / 3100: of a step at 9 m, 173 mm, at an incidence of 500 / 9000
 
 
+def test_rays_without_a_return_are_free_as_far_as_the_scan_reaches():
+    """Walls at 10 m but for a gate, through which rays come back from nothing: what is beyond 10 m is not known."""
+    turn, height = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 1200), np.linspace(-0.4, 0.4, 160))
+    rays = np.stack([np.cos(height) * np.cos(turn), np.cos(height) * np.sin(turn), np.sin(height)], axis=-1)
+    rays, gate = rays.reshape(-1, 3), (np.abs(np.angle(np.exp(1j * turn))) < 0.3).ravel()
+    space = free_space.FreeSpace.from_rays(10_000.0 * rays[~gate], [rays[gate]])
+    on_axis = np.array([[5000.0, 0.0, 0.0], [9700.0, 0.0, 0.0], [12000.0, 0.0, 0.0], [-5000.0, 0.0, 0.0]])
+    free = space.contains(on_axis, 50.0)
+    assert free.tolist() == [free_space.UNANSWERED, free_space.UNANSWERED, 0.0, 1.0]
+
+
 def test_groups_that_no_sure_pose_joins_are_searched_deeper(monkeypatch):
     """A chain of four scans: of the pair in its middle only the deep search finds the pose."""
     patches = [SimpleNamespace(row=row, patches=SimpleNamespace(weight=np.ones(9))) for row in range(4)]

@@ -18,13 +18,20 @@ SEEN_NEIGHBOURS = 5  # of 3 x 3 pixels, that must hold rays for a point to count
 FILLED = 0.85  # share of the pixels with points that must have so many neighbours: else pixels are too small
 RAYS = 2.0  # across a patch, that are sure to hit it
 UNANSWERED = 0.3  # weight of a point in a direction of rays without a return: bare steel may return none as well
+# Share of the ranges that are below the reach of a scan: beyond it no return is no evidence, as the scanner, or who
+# exported its scan, may have cut it off there. Strays beyond are fewer than one in 100.
+WITHIN_REACH, RANGES = 0.99, 200_000  # and the number of ranges that show it
 
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """Range image (6, n, n) of the least range seen in each direction, mm; infinite = no return, negative = no ray."""
+    """Range image (6, n, n) of the least range seen in each direction, mm; infinite = no return, negative = no ray.
+
+    Rays without a return met nothing up to ``reach_mm``.
+    """
 
     near: Floats
+    reach_mm: float = np.inf
 
     @classmethod
     def from_rays(cls, points: Floats, unanswered: Iterable[Floats]) -> FreeSpace:
@@ -40,16 +47,17 @@ class FreeSpace:
             n = int(n / 1.3)
         for rays in unanswered:
             write_unanswered(rays, near, n)
-        return cls(near)
+        some = large_arrays.every(points, max(1, len(points) // RANGES))
+        return cls(near, float(np.quantile(np.linalg.norm(some, axis=1), WITHIN_REACH)) if len(some) else 0.0)
 
     def contains(self, points: Floats, tolerance_mm: float, slope: float = 0.02) -> Floats:
         """Return the weight (n,) with which points (n, 3) lie in free space by more than a margin: 1, or 0 outside.
 
         The margin is ``tolerance_mm`` plus ``slope`` times the range. Among rays without a return the weight is
-        UNANSWERED.
+        UNANSWERED, up to the reach.
         """
-        weight = np.zeros(len(points))
-        weigh_free(np.ascontiguousarray(points), self.near, tolerance_mm, slope, SEEN_NEIGHBOURS, UNANSWERED, weight)
+        weight, margin = np.zeros(len(points)), (tolerance_mm, slope)
+        weigh_free(np.ascontiguousarray(points), self.near, self.reach_mm, margin, SEEN_NEIGHBOURS, UNANSWERED, weight)
         return weight
 
     def resolved(self, points: Floats, normals: Floats, side_mm: float) -> Floats:
@@ -107,9 +115,9 @@ def write_unanswered(rays, near, n):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def weigh_free(points, near, tolerance, slope, least, unanswered, weight):  # type: ignore[no-untyped-def]
+def weigh_free(points, near, reach, margin, least, unanswered, weight):  # type: ignore[no-untyped-def]
     """Write the weight (n,) of points nearer than the ranges of all pixels around them; others are left as they are."""
-    n = near.shape[1]
+    n, (tolerance, slope) = near.shape[1], margin
     for k in range(len(points)):
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
         f, i, j = pixel(x, y, z, n)
@@ -121,8 +129,9 @@ def weigh_free(points, near, tolerance, slope, least, unanswered, weight):  # ty
                 if 0 <= a < n and 0 <= b < n and near[f, a, b] >= 0.0:
                     seen += 1
                     nearest = min(nearest, near[f, a, b])
-        if seen >= least and r < nearest - tolerance - slope * r:
-            weight[k] = 1.0 if nearest < np.inf else unanswered
+        answered = nearest < np.inf
+        if seen >= least and r < (nearest if answered else reach) - tolerance - slope * r:
+            weight[k] = 1.0 if answered else unanswered
 
 
 @njit(cache=True, nogil=True)
