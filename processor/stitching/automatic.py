@@ -83,6 +83,7 @@ def stitch(
     if gross:
         solution, blocks = _without_gross_pairs(blocks, solution, gross, reference)
         added, _ = direction_errors.added_covariance(blocks, solution, reference)
+    added += direction_errors.covariance_by_incidence(blocks, solution, reference)
     solution = replace(solution, covariance=solution.covariance + added)
     scores = network.scores(patches, solution.T, placed.still is not None)
     refuted = network.refuted(scores, len(scans), reference)

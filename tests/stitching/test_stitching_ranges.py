@@ -187,3 +187,23 @@ def test_points_moved_in_a_half_of_one_scan_widen_the_poses():
     off = solution.T[2, :3, 3] - T[2, :3, 3]
     assert np.abs(off).max() > 4.0 * np.sqrt(np.diag(solution.covariance)[15:18]).max()  # that of pieces is too small
     assert (np.abs(off) < 2.0 * np.sqrt(added)).all()
+
+
+def test_bias_by_incidence_of_the_class_widens_the_poses_by_what_it_moves_them():
+    """Ranges of all scans are longer by 0.3 mm (1 / cos - 1), up to 74 degrees, as class phase states them."""
+    T, (points, normals) = stations(), wall_points()
+    shift = np.zeros((4, len(points)))
+    for s in range(4):
+        rays = points.mean(axis=1) - T[s, :3, 3]
+        along = np.einsum("ni,ni->n", rays / np.linalg.norm(rays, axis=1)[:, None], normals)
+        shift[s] = 0.3 * (1.0 / np.maximum(np.abs(along), 0.28) - 1.0) * along
+    blocks = blocks_of(T, points, normals, np.zeros(4), each=1600, shift=shift)
+    exact = blocks_of(T, points, normals, np.zeros(4), each=1600)
+    solution = bundle_adjustment.solve(blocks, T, 0, tau=(0.0, 0.0, 0.0), robust=False)
+    moved = (solution.T - bundle_adjustment.solve(exact, T, 0, tau=(0.0, 0.0, 0.0), robust=False).T)[1:, :3, 3]
+    covariance = direction_errors.covariance_by_incidence(exact, solution, 0)
+    np.testing.assert_array_equal(covariance[:6], 0.0)
+    expected = np.sqrt(np.diag(covariance))[6:].reshape(3, 6)[:, 3:]
+    assert np.abs(moved).max() > 0.03
+    # Pieces 10 to 15 m wide have rays of many incidences, of which the data here have the middle one's bias alone.
+    np.testing.assert_allclose(np.abs(moved), expected, rtol=0.1, atol=0.01)

@@ -66,9 +66,10 @@ def register_pair(blocks: Blocks, network: Solution, a: int, b: int, variance: f
     start = np.stack([np.eye(4), rigid.invert(network.T[a]) @ network.T[b]])
     solution = bundle_adjustment.solve(local, start, 0, iterations=3, robust=False, tau=network.tau)
     by_unit = direction_errors.added_covariance(local, solution, 0, 1.0)[0][6:, 6:]
-    covariance = solution.covariance[6:, 6:] + variance * by_unit
+    own = solution.covariance[6:, 6:] + direction_errors.covariance_by_incidence(local, solution, 0)[6:, 6:]
+    covariance = own + variance * by_unit
     # What something that moved makes of the variance excuses no pair.
-    expected = solution.covariance[6:, 6:] + min(variance, scanner_class_errors.known().view_mm ** 2) * by_unit
+    expected = own + min(variance, scanner_class_errors.known().view_mm ** 2) * by_unit
     d = poses_with_scale.difference(solution.T[1], start[1])[:6]
     points = local.kind == ON_PIECE
     weight = local.sums[points, 9]
