@@ -54,7 +54,7 @@ def test_scan_of_half_a_part_gets_no_other_assignment(shapes):
     assert assignment.rather(points[along < 0.0], 1, shapes) is None
 
 
-@pytest.mark.parametrize("attitude_of_rough", [1, 3])
+@pytest.mark.parametrize("attitude_of_rough", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_scan_whose_rough_pose_is_turned_half_round_gets_no_other_assignment(shapes, attitude_of_rough, monkeypatch):
     """All attitudes of the part itself are tried before its scan is called another part's."""
     rng = np.random.default_rng(1)
