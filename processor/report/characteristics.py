@@ -23,8 +23,12 @@ MOST_NAMED = 4  # of a summary of one or two lines
 
 def worst_first(rows: Iterable[Judged]) -> list[Judged]:
     """Return what was judged with the worst first, what was not measured last, else in its order."""
-    order = {verdict: place for place, verdict in enumerate(WORST_FIRST)}
-    return sorted(rows, key=lambda one: (order.get(one.verdict, len(order)), not math.isfinite(one.value)))
+    return sorted(rows, key=lambda one: (rank(one.verdict), not math.isfinite(one.value)))
+
+
+def rank(verdict: Verdict) -> int:
+    """Return the place of a verdict among all, 0 the worst; "none" is last."""
+    return WORST_FIRST.index(verdict) if verdict in WORST_FIRST else len(WORST_FIRST)
 
 
 def limits_of(run: StepRun) -> JudgedLimits | None:

@@ -228,13 +228,19 @@ def along_the_arch(came, to):
     return rigid.transform(R, middle - R @ middle)
 
 
-def test_scan_of_a_shorter_part_in_a_longer_one_s_place_is_named_by_its_ends(monkeypatch):
-    """All of its points lie on the longer part: that has steel where they end, which is not seen."""
+def shorter_rib(monkeypatch):
+    """The bridge, and the points (n, 3) of rib2 in its frame; as a scan of the longer rib1 they are found on that."""
     scene, truth = arch_clouds.bridge(spacing_mm=30.0, sigma_mm=1.0, seed=1)
     points = rigid.apply(truth.arch.T_bridge_scan[2], scene.scans[2].points)
     poses = {"rib1": along_the_arch(2, 1), "rib2": np.eye(4)}
     find = lambda _, part, *__: attitude.Attitude(poses[part.name], poses[part.name], Status.OK)  # noqa: E731
     monkeypatch.setattr(attitude, "find", find)
+    return scene, points
+
+
+def test_scan_of_a_shorter_part_in_a_longer_one_s_place_is_named_by_its_ends(monkeypatch):
+    """All of its points lie on the longer part: that has steel where they end, which is not seen."""
+    scene, points = shorter_rib(monkeypatch)
     monkeypatch.setattr(assignment, "rather", lambda *_: None)  # as where the underside was not seen: sizes are others
     found = measure._place(Scan("scan", points, component="rib1"), 1, shapes_of(scene.arch), 1.0)
     assert (found.rejected, codes(found.doubts), found.parts) == ((), ["preassemble.ends-of-other"], ("rib2",))
@@ -247,11 +253,7 @@ def test_scan_of_a_shorter_part_in_a_longer_one_s_place_is_named_by_its_ends(mon
 
 def test_scan_of_a_shorter_part_in_its_own_place_is_no_longer_part_s(monkeypatch):
     """Its points lie on the longer part as well, to what a rough pose shows; only of its own it shows both ends."""
-    scene, truth = arch_clouds.bridge(spacing_mm=30.0, sigma_mm=1.0, seed=1)
-    points = rigid.apply(truth.arch.T_bridge_scan[2], scene.scans[2].points)
-    poses = {"rib1": along_the_arch(2, 1), "rib2": np.eye(4)}
-    find = lambda _, part, *__: attitude.Attitude(poses[part.name], poses[part.name], Status.OK)  # noqa: E731
-    monkeypatch.setattr(attitude, "find", find)
+    scene, points = shorter_rib(monkeypatch)
     monkeypatch.setattr(assignment, "rather", lambda _, index, *__: 1 if index == 2 else None)
     own = measure._place(Scan("scan", points, component="rib2"), 2, shapes_of(scene.arch), 1.0)
     assert (own.rejected, own.doubts, own.parts) == ((), (), ("rib2",))

@@ -440,16 +440,15 @@ def _identified(scan: Scan, points: Floats, station: Ints, index: int, shapes: a
     if other is not None:
         # Only a scan that fits the other part is of the other part; a misfit may have other causes.
         there = _register(scan, points, station, other, shapes) if other >= 0 else None
-        if there is None or not (there.rejected or there.doubts):
-            parts = () if there is None else there.identity.parts(shapes.design.parts[other].name)
-            if part.name not in parts:
-                if there is not None or not assignment.of_size(points, shapes):
-                    placed = _register(scan, points, station, index, shapes)
-                    if any(one.code == "preassemble.splice-plates" for one in placed.rejected):  # longer than any part
-                        return replace(placed, parts=every)
-                if there is None or not _fits_with_ends(placed, index, there, other, shapes):
-                    why = (*ScanParts(scan.name, part.name, parts).wrong, *_resemblance(points, index, shapes))
-                    return _PlacedScan(scan, points, station, attitude.NOWHERE, rejected=why, parts=parts)
+        parts = () if there is None else there.identity.parts(shapes.design.parts[other].name)
+        if part.name not in parts and (there is None or not (there.rejected or there.doubts)):
+            if there is not None or not assignment.of_size(points, shapes):
+                placed = _register(scan, points, station, index, shapes)
+                if any(one.code == "preassemble.splice-plates" for one in placed.rejected):  # longer than any part
+                    return replace(placed, parts=every)
+            if there is None or not _fits_with_ends(placed, index, there, other, shapes):
+                why = (*ScanParts(scan.name, part.name, parts).wrong, *_resemblance(points, index, shapes))
+                return _PlacedScan(scan, points, station, attitude.NOWHERE, rejected=why, parts=parts)
     placed = placed or _register(scan, points, station, index, shapes)
     if placed.identity.contradiction and not placed.rejected:
         # A part of another size may by chance have its mark where the other part of this shape has its own.

@@ -15,12 +15,12 @@ from matplotlib.textpath import TextPath
 
 from processor.language.messages import Message, messages, text
 from processor.limits.judging import Judged
-from processor.model import WORST_FIRST, ArchDesign, Floats, Ints, Scene, Verdict
+from processor.model import ArchDesign, Floats, Ints, Scene, Verdict
 from processor.report import characteristics
 from processor.report.style import LATIN, drawable, png
 
 TONES = {Verdict.PASS: "#1b7a3d", Verdict.FAIL: "#b3261e", Verdict.INDETERMINATE: "#9a6700", Verdict.NONE: "#44505c"}
-PLAIN = np.array([0.86, 0.89, 0.92])  # of steel that nothing is said of
+PLAIN = np.array([0.86, 0.89, 0.92])  # of steel without a callout
 MOST_FACETS = 40_000  # drawn in a second; of more, vertices in a grid of CELLS are one
 CELLS = 250  # along the longest side: a cell is some pixels
 FLAT = 0.3  # height by breadth below which a structure is seen from well above, as a roof is
@@ -36,7 +36,7 @@ MOST_NAMED = 24  # parts
 
 @dataclass(frozen=True)
 class Callout:
-    """What is said of a place (3,) of the design, in mm; ``part`` is drawn in the verdict's colour."""
+    """A sentence on a place (3,) of the design, in mm; ``part`` is drawn in the verdict's colour."""
 
     place: Floats
     said: Message
@@ -62,9 +62,8 @@ def of_judged(place: Floats, judged: Sequence[Judged], name: Message | str, part
 
 def draw(scene: Scene, callouts: Sequence[Callout]) -> bytes:
     """Draw the design, without one the places of all callouts, with the worst callouts as PNG; b"" of nothing."""
-    order = {verdict: place for place, verdict in enumerate(WORST_FIRST)}
     known = [one for one in callouts if np.isfinite(one.place).all()]
-    chosen = sorted(known, key=lambda one: order.get(one.verdict, len(order)))[:MOST_CALLOUTS]
+    chosen = sorted(known, key=lambda one: characteristics.rank(one.verdict))[:MOST_CALLOUTS]
     parts = list(_surfaces(scene))
     lines = [] if scene.arch is None else list(_bare(scene.arch))
     places = [*(vertices for _, vertices, _ in parts), *lines, *([] if scene.frame is None else [scene.frame.centres])]
